@@ -28,6 +28,12 @@ Z90 = 1.645
 DIFFERENCE_SHARE = 0.02
 """Step of a parameter for the derivative of a form, over its value."""
 
+TANGENT_SHARE = 1.5e-8
+"""The same within the fit: the square root of the rounding error."""
+
+FIT_TOLERANCE = 1e-6
+"""Relative change of the misfit at which a fit ends; a misfit decides by its size, not by its sixth digit."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
@@ -69,11 +75,24 @@ class _Knots:
         return len(self.used)
 
     def difference(self, form: Form, values: FloatArray) -> FloatArray:
-        """Piecewise linear approximation of a form minus the curve, over the band, at the knots."""
-        grid = self.projections[0] @ form.value(values, self.inputs)  # curves have one or two axes
-        if len(self.projections) == 2:
-            grid = grid @ self.projections[1].T
-        return np.asarray((grid.ravel()[self.used] - self.measured) / self.std)
+        """Piecewise linear approximation of a form minus the curve, over the band, at the knots.
+
+        Args:
+            form: with p parameters.
+            values: of the parameters (p,), or several sets of them (m, p).
+
+        Returns:
+            Differences (n,), or (m, n).
+        """
+        axes = len(self.projections)  # curves have one or two
+        columns = np.moveaxis(values, -1, 0)
+        sets = columns.shape[1:]
+        on_grid = form.value(columns.reshape(*columns.shape, *[1] * axes), self.inputs)
+        if axes == 2:
+            grid = self.projections[0] @ on_grid @ self.projections[1].T
+        else:
+            grid = on_grid @ self.projections[0].T
+        return np.asarray((grid.reshape(*sets, -1)[..., self.used] - self.measured) / self.std)
 
 
 def identify_form(curve: CurveFinding, covariance: FloatArray | None, settings: CurveSettings) -> FormFinding | None:
@@ -116,8 +135,9 @@ def _fitted(form: Form, knots: _Knots, settings: CurveSettings) -> _Candidate:
     best, values = knots.difference(form, np.zeros(0)) if not form.parameters else None, np.zeros(0)
     for start in itertools.product(*(p.starts for p in form.parameters)) if form.parameters else ():
         result = least_squares(
-            lambda z: knots.difference(form, z), start, bounds=(low, high), x_scale=np.abs(start) + 1e-3
-        )
+            lambda z: knots.difference(form, z), start, jac=lambda z: _tangent(form, knots, z, high),
+            bounds=(low, high), x_scale=np.abs(start) + 1e-3, ftol=FIT_TOLERANCE,
+        )  # fmt: skip
         if best is None or result.cost < 0.5 * float(best @ best):
             best, values = result.fun, result.x
     assert best is not None
@@ -133,14 +153,21 @@ def _fitted(form: Form, knots: _Knots, settings: CurveSettings) -> _Candidate:
     return _Candidate(form, values, gain @ knots.correlation @ gain.T, float(best @ best), limit, rms)
 
 
+def _tangent(form: Form, knots: _Knots, values: FloatArray, high: FloatArray) -> FloatArray:
+    """Derivative (k, p) by differences over small steps, which end within the bounds."""
+    steps = TANGENT_SHARE * np.maximum(np.abs(values), 1.0)
+    steps = np.where(values + steps > high, -steps, steps)
+    moved = knots.difference(form, np.concatenate([values[None], values + np.diag(steps)]))
+    return np.asarray((moved[1:] - moved[0]).T / steps)
+
+
 def _jacobian(form: Form, knots: _Knots, values: FloatArray) -> FloatArray:
-    """Differences (k, n) over steps of 2 %, as a form with a bend has no smooth derivative between the fine points."""
-    steps = np.diag(DIFFERENCE_SHARE * np.maximum(np.abs(values), 1e-2))
-    rows = [
-        (knots.difference(form, values + step) - knots.difference(form, values - step)) / (2.0 * step.sum())
-        for step in steps
-    ]
-    return np.stack(rows, axis=1) if rows else np.zeros((len(knots), 0))
+    """Differences (k, p) over steps of 2 %, as a form with a bend has no smooth derivative between the fine points."""
+    if not len(values):
+        return np.zeros((len(knots), 0))
+    steps = DIFFERENCE_SHARE * np.maximum(np.abs(values), 1e-2)
+    ahead, behind = (knots.difference(form, values + sign * np.diag(steps)) for sign in (1.0, -1.0))
+    return np.asarray((ahead - behind).T / (2.0 * steps))
 
 
 def _estimates(candidate: _Candidate) -> dict[str, Estimate]:

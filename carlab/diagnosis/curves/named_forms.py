@@ -44,8 +44,9 @@ class Form:
     function: Callable[..., FloatArray]
 
     def value(self, parameters: FloatArray, inputs: tuple[FloatArray, ...]) -> FloatArray:
-        """Values at inputs of one shape."""
-        return np.broadcast_to(self.function(*parameters, *inputs), inputs[0].shape)
+        """Values at inputs of one shape; parameters may have axes before those of the inputs."""
+        sets = np.broadcast_shapes(*(np.shape(p) for p in parameters), inputs[0].shape)
+        return np.broadcast_to(self.function(*parameters, *inputs), sets)
 
 
 def dead_band(x: FloatArray, width: float) -> FloatArray:
@@ -133,7 +134,7 @@ TYRE_FORMS = (
     Form("limited_tyre", "a linear tyre up to a limit of grip", (_STIFFNESS, _GRIP),
          lambda stiffness, grip, slip: np.minimum(stiffness * slip, grip)),
     Form("saturating_tyre", "a tyre that saturates", (_STIFFNESS, _GRIP),
-         lambda stiffness, grip, slip: grip * np.tanh(stiffness * slip / max(grip, 1e-9))),
+         lambda stiffness, grip, slip: grip * np.tanh(stiffness * slip / np.maximum(grip, 1e-9))),
     Form("pacejka_tyre", "a Pacejka tyre",
          (_GRIP, FormParameter("B", "1/rad", (6.0,)), FormParameter("C", "1", (1.5,), 0.5, 2.5)),
          lambda grip, b, c, slip: grip * np.sin(c * np.arctan(b * slip))),
