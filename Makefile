@@ -4,6 +4,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Bytecode is written, so that each process does not compile each module again.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-slow lint ruff types layers computing driving docs pictures clean
 
@@ -11,9 +13,11 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "carlab needs Python 3.11 or newer; run: make PYTHON=python3.12 ...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	@# torch first and by its exact version, so that nothing else pulls in another build of it.
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@# torch first and by its exact version, so that nothing else pulls in another build of it. Bytecode of all its
+	@# modules would take half of the installation; the last line writes that of the modules in use.
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'
+	@$(BIN)/python -c 'import torch, stable_baselines3, scipy.signal, matplotlib.pyplot, pyarrow, rerun'
 	@touch $@
 
 demo: $(VENV)/.installed
@@ -46,8 +50,6 @@ COMPUTING := tests/examples tests/diagnosis tests/cli tests/studies tests/benchm
 PROCESSES = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 YIELD := nice -n 19
 computing driving test-slow: export OMP_NUM_THREADS := 1
-# Processes that the tests start read the bytecode of carlab instead of compiling it again.
-computing driving test-slow: export PYTHONDONTWRITEBYTECODE :=
 
 computing:
 	$(YIELD) $(BIN)/pytest --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder $(COMPUTING)
