@@ -124,7 +124,17 @@ def test_car_file_of_a_wrong_base_model_differs_in_its_kind_only() -> None:
     np.testing.assert_array_equal(wrong.fit["vx"], same.fit["vx"])  # the true car is the same
     assert wrong.excess == same.excess
     assert wrong.answer()["conditions"] == ["short recording", "base model kinematic"]
+    assert wrong.answer()["implied_effects"] == ["tyre_saturation"]
     assert Conditions(base_model="linear_tyre").implied_effects() == ("tyre_saturation",)
+    assert not Conditions().implied_effects()
+
+
+def test_a_concealed_effect_is_not_implied_by_the_base_model() -> None:
+    kinematic = Conditions(base_model="kinematic")
+    case = make_case(
+        "single", 35, effects=("tyre_saturation",), excess=2.0, conditions=kinematic, fit_s=8.0, hold_s=5.0
+    )
+    assert case.answer()["implied_effects"] == []
 
 
 def test_each_of_three_effects_has_the_asked_strength() -> None:

@@ -55,6 +55,7 @@ class Case:
         total = np.array(self.refit.channels)
         share = np.maximum(total**2 - 1.0, 0.0)
         main = [name for name, s in zip(CHANNELS, share, strict=True) if s >= 0.5 * share.max() > 0.0]
+        concealed = {c.form.id for c in self.concealed}
         return {
             "kind": self.kind,
             "seed": self.seed,
@@ -70,7 +71,7 @@ class Case:
             "refit_score": self.refit.score,
             "fault": self.fault,
             "conditions": self.conditions.names(self.fit_s),
-            "implied_effects": list(self.conditions.implied_effects()),
+            "implied_effects": [e for e in self.conditions.implied_effects() if e not in concealed],
         }
 
     def _effect(self, c: Concealed) -> dict[str, Any]:

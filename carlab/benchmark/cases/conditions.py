@@ -41,8 +41,8 @@ class Conditions:
         return [name for name, is_present in present.items() if is_present]
 
     def implied_effects(self) -> tuple[str, ...]:
-        """Effects that a wrong car file lacks whatever is concealed: with linear tyres their saturation."""
-        return ("tyre_saturation",) if self.base_model == "linear_tyre" else ()
+        """Effects that a wrong car file lacks whatever is concealed: linear tyres and wheels without slip saturate."""
+        return () if self.base_model == "same" else ("tyre_saturation",)
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON."""
