@@ -1,8 +1,8 @@
 """Complete example: a car that differs from its car file learns to park, and a diagnosis identifies the differences.
 
 The servo of the emulated car lags by 70 ms, and its motor is weaker than in the car file. carlab reads only the car
-file and the measurements of the emulated hardware. Takes about four and a half minutes on two idle cores;
-``python examples/demo.py --car sim --updates 300`` takes one or two.
+file and the measurements of the emulated hardware. Takes five minutes on two idle cores, or one or two with
+``--car sim --updates 300``.
 """
 
 import argparse
@@ -83,7 +83,7 @@ def main() -> None:
     """Learn, drive, diagnose, and print the paths of the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--car", default="emulated", choices=("sim", "emulated", "emulated-can"))
-    parser.add_argument("--updates", type=int, default=20000, help="gradient steps of the policy before an episode")
+    parser.add_argument("--updates", type=int, default=12000, help="gradient steps of the policy before an episode")
     parser.add_argument("--model-steps", type=int, default=None, help="optimiser steps of the learned car")
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--effects", nargs="*", default=(), help="try only these effects, which is faster")
