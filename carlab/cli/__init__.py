@@ -1,7 +1,7 @@
 """``carlab VERB``: one file per verb; the help texts are the docstrings.
 
-Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 5 recordings not sufficient (``diagnose``), 130
-interrupted, 141 the reader of a pipe ended.
+Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 5 recordings not sufficient (``diagnose``,
+``bench realcars``), 130 interrupted, 141 the reader of a pipe ended.
 """
 
 from __future__ import annotations

@@ -135,4 +135,6 @@ class Diagnose:
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
         if not self.curves and (advice := curves_advice(diagnosis)):
             console.print(advice)
-        console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")
+        console.print(
+            f"Read {self.out / 'report.html'}; simulate the diagnosed car with --car {self.out / 'model.toml'}."
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +18,7 @@ class Emulate:
     """Run emulated hardware as a process: a VESC and a NatNet server that share one simulated car.
 
     The VESC is on a pseudo-terminal or a CAN bus. Any program with these protocols can use the hardware; carlab uses it
-    with a car file that names the port. It runs until ^C.
+    with a car file that has the printed tables. It runs until ^C.
     """
 
     actuator: Literal["serial", "can"] = "serial"
@@ -56,9 +56,12 @@ class Emulate:
 
     def run(self) -> int:
         """Serve until interrupted."""
+        import tomli_w
+
         from carlab.cars import default_car, load_car_file
         from carlab.cars.emulated_world import World, WorldConfig
         from carlab.experiment.episodes.interrupts import Interrupts
+        from drivers.calibration import ActuatorCalibration
 
         self._check_options()
         file = default_car() if self.vehicle is None else load_car_file(self.vehicle)
@@ -85,7 +88,8 @@ class Emulate:
                 lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{addresses["can_channel"]}"']
             lines += ["[hardware.mocap]", 'server_address = "127.0.0.1"', 'local_interface = "127.0.0.1"']
             lines += [f'mode = "{self.mode}"', f"command_port = {addresses['command_port']}", f'body = "{config.body}"']
-            console.print("\n".join(lines), soft_wrap=True)
+            calibration = tomli_w.dumps({"hardware": {"calibration": asdict(ActuatorCalibration())}}).rstrip()
+            console.print("\n".join([*lines, calibration]), soft_wrap=True)
             console.print("^C ends it.")
             while not interrupts.requested.wait(0.2):
                 pass

@@ -1,6 +1,7 @@
 """Quantities at the interfaces between packages: immutable, in SI units, with the unit in every name.
 
-Frames (REP-103, REP-105): world frame ``map`` and body frame ``base_link``; x forward, y left, yaw counter-clockwise.
+Frames (REP-103, REP-105): world frame ``map`` and body frame ``base_link`` with its origin at the
+centre of mass; x forward, y left, yaw counter-clockwise.
 Commands are dimensionless in [-1, 1]; steering is positive to the left, throttle is positive forward.
 """
 

@@ -77,8 +77,8 @@ class ColumnMapping:
     velocity_frame: Literal["body", "world"] = "body"
     """Frame of the vx, vy columns."""
     velocity_lag_s: float = 0.0
-    """Known delay of the velocity columns behind the pose [s]; world velocities are rotated by the yaw of that "
-    "moment."""
+    """Known delay of the velocity columns behind the pose [s]; world velocities are rotated by the yaw of that
+    moment."""
     velocities: Literal["columns", "pose"] = "columns"
     """``pose``: estimate velocities from the pose, centred, without delay; their columns are kept as extra."""
     swap_xy: bool = False
@@ -90,8 +90,8 @@ class ColumnMapping:
     throttle_gate: str | None = None
     """Column that multiplied the throttle on the car: ``requested`` keeps the column, ``sent`` is the product."""
     references: Mapping[str, str] = field(default_factory=dict)
-    """Further sensor columns that measure a state channel again, for example ``{"vel encoder" = "vx"}``: only "
-    "compared."""
+    """Further sensor columns that measure a state channel again, for example ``{"vel encoder" = "vx"}``: only
+    compared."""
     dead_reckoning: bool = False
     """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
     clock: Literal["column", "velocity", "even"] = "column"

@@ -1,7 +1,7 @@
 """The folder of one run: its files and the environment of the run.
 
 runs/2026-11-21_134500_<name>/
-    config.toml          the resolved configuration
+    config.toml          the car file of the run
     environment.json     program, git, packages, host, start
     episodes/0001.mcap   one recording per episode, also as 0001.rrd
     episodes/stopped/    episodes of a learning run that a person ended; they are driven again
@@ -55,7 +55,7 @@ class RunDirectory:
         Args:
             root: Folder of all runs, usually ``runs``.
             name: Name of the run; characters that are invalid in file names become ``-``.
-            config_toml: The resolved configuration.
+            config_toml: The car file of the run.
             metadata: Further facts for environment.json.
 
         Raises:

@@ -29,19 +29,32 @@ def folder() -> Path:
 def object_code(depends_on: tuple[str, ...], compiled: Callable[[], bytes]) -> bytes:
     """The object code from its file, or from ``compiled``, which is then written to the file.
 
-    A file that is damaged is replaced; a folder that cannot be read or written is ignored.
+    A file that is damaged is replaced. A folder that cannot be read or written, or that other users can write to, is
+    not used.
 
     Args:
         depends_on: everything that the code depends on: source, processor, version of the compiler.
         compiled: compiles it.
     """
-    path = folder() / (_hash("\0".join(depends_on).encode()).hex() + _SUFFIX)
+    place = folder()
+    if not _is_own(place):
+        return compiled()
+    path = place / (_hash("\0".join(depends_on).encode()).hex() + _SUFFIX)
     code = _read(path)
     if code is None:
         code = compiled()
         with contextlib.suppress(OSError):
             _write(path, code)
     return code
+
+
+def _is_own(place: Path) -> bool:
+    """Whether no other user can write to a folder; a folder that does not exist yet is created by this one."""
+    try:
+        status = place.stat()
+    except OSError:
+        return True
+    return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
 
 
 def _hash(content: bytes) -> bytes:

@@ -50,10 +50,10 @@ class TyreSaturation(DynamicsEffect):
     refuted_if = "even at walking pace, turns tighten less than in proportion to the command (then it is the steering)"
     parameters = (
         EffectParameter("mu_front", "1", None, 0.0, 5.0, 0.43, same_as="tyre.front.mu"),
-        EffectParameter("B_front", "1", None, 0.0, 100.0, 2.75, positive=True, same_as="tyre.front.B"),
+        EffectParameter("B_front", "1/rad", None, 0.0, 100.0, 2.75, positive=True, same_as="tyre.front.B"),
         EffectParameter("C_front", "1", None, 0.0, 10.0, 1.45, positive=True, same_as="tyre.front.C"),
         EffectParameter("mu_rear", "1", None, 0.0, 5.0, 0.42, same_as="tyre.rear.mu"),
-        EffectParameter("B_rear", "1", None, 0.0, 100.0, 5.0, positive=True, same_as="tyre.rear.B"),
+        EffectParameter("B_rear", "1/rad", None, 0.0, 100.0, 5.0, positive=True, same_as="tyre.rear.B"),
         EffectParameter("C_rear", "1", None, 0.0, 10.0, 1.3, positive=True, same_as="tyre.rear.C"),
     )
     base_models = ("linear_tyre", "kinematic", "blend")

@@ -73,6 +73,15 @@ def test_folder_that_cannot_be_written_is_ignored(place: Path) -> None:
     assert np.allclose(values(cubic()), X**3 - X, rtol=1e-15, atol=1e-15)
 
 
+def test_folder_that_other_users_can_write_to_is_not_used(place: Path) -> None:
+    assert code_store.object_code(("a",), lambda: b"own") == b"own"
+    [path] = place.iterdir()
+    place.chmod(0o777)
+    assert code_store.object_code(("a",), lambda: b"compiled again") == b"compiled again"
+    assert code_store.object_code(("b",), lambda: b"not stored") == b"not stored"
+    assert list(place.iterdir()) == [path]
+
+
 def test_older_half_is_removed(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(code_store, "MAX_FILES", 4)
     for k in range(4):
