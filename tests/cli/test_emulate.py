@@ -1,0 +1,36 @@
+"""``carlab emulate`` prints the tables of a car file that drives its hardware."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+from carlab.cars import load_car_file
+from drivers.calibration import ActuatorCalibration
+
+ARENA = "[hardware.arena]\ncorners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]\n"
+
+
+def test_printed_tables_are_a_car_file_with_the_emulated_calibration(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "carlab", "emulate", "--port", str(tmp_path / "vesc")]
+    ports = ["--command-port", "0", "--data-port", "0"]
+    with subprocess.Popen([*command, *ports], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        lines = []
+        for line in process.stdout:
+            if line.startswith("^C"):
+                break
+            lines.append(line)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20.0) == 0
+    assert lines[0].startswith("EMULATED")
+    printed = "".join(lines[1:])
+    assert set(tomllib.loads(printed)["hardware"]) == {"actuator", "mocap", "calibration"}
+    (tmp_path / "car.toml").write_text(ARENA + printed)
+    file = load_car_file(tmp_path / "car.toml")
+    assert file.real is not None
+    assert file.real.hardware.calibration == ActuatorCalibration()
+    assert file.real.hardware.actuator.port == str(tmp_path / "vesc")
