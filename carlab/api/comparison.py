@@ -40,11 +40,11 @@ def compare(
         stop: callback; if it returns true, the changes so far are the result.
 
     Returns:
-        The smallest set of changes with 90 % intervals; verdict "changed" or "nothing".
+        The smallest set of changes with 90 % intervals; verdict "changed", "nothing", or "inconclusive" after a stop.
 
     Raises:
         ConfigError: a group is empty, a recording is in both groups, or a candidate does not exist.
-        DataError: a group is too short or too uniform; the message states what to record.
+        DataError: a recording cannot be read, or a group is too short or too uniform; the message has the remedy.
     """
     from carlab.core.errors import ConfigError
     from carlab.core.tables import nearest_name

@@ -126,7 +126,7 @@ def drive(
         The run; ``episodes`` is empty if it was interrupted before the first.
 
     Raises:
-        ConfigError: an argument is invalid.
+        ConfigError, DataError: an argument is invalid, or a file cannot be written.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
     from carlab.cars import choose_car

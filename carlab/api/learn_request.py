@@ -111,5 +111,5 @@ def _name_of(car: str | CarFile) -> str:
 
 
 def checked_simulator(request: LearnRequest) -> SimulatorConfig | None:
-    """The simulator of the quick check, if it is not that of the car file."""
+    """The simulator of the quick check, if it is not that of the car file. Raises ConfigError for an invalid file."""
     return None if request.prior in BUILT_IN_PRIORS else _prior_file(request.prior).simulator

@@ -162,7 +162,7 @@ def predict(
 
     Raises:
         ConfigError: an argument is invalid.
-        DataError: the recording holds no window of that length in which the car moves.
+        DataError: the recording cannot be read, or holds no window of that length in which the car moves.
     """
     from carlab.diagnosis.score_recording import score_recording
 

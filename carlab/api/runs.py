@@ -83,7 +83,12 @@ class RunHooks:
 def new_run(
     out: Path | str, name: str, choice: CarChoice, hooks: RunHooks, keep: str = "episodes"
 ) -> Iterator[RunDirectory]:
-    """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty or missing."""
+    """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty or missing.
+
+    Raises:
+        ConfigError: a child process executes the program's script again.
+        DataError: the folder cannot be written.
+    """
     from carlab.recording.run_folder import RunDirectory
 
     _refuse_second_execution()
@@ -98,7 +103,12 @@ def new_run(
 
 @contextmanager
 def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterator[RunDirectory]:
-    """Open the folder of a resumed run; the program's log is appended."""
+    """Open the folder of a resumed run; the program's log is appended.
+
+    Raises:
+        ConfigError: a child process executes the program's script again.
+        DataError: the path is not a run's folder, or it cannot be written.
+    """
     from carlab.recording.run_folder import RunDirectory
 
     _refuse_second_execution()

@@ -12,7 +12,7 @@ from carlab.core.quantities import FloatArray
 
 
 def wrap(angle_rad: Any) -> Any:
-    """Map onto [-pi, pi). Differentiable with slope 1 for torch tensors."""
+    """Map angles (...) onto [-pi, pi). Differentiable with slope 1 for torch tensors."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -23,6 +23,9 @@ def align_unwrapped(measured_rad: FloatArray, starts: ArrayLike, predicted_rad: 
         measured_rad: angle at the ticks (n,).
         starts: tick of the first angle of each prediction (B,).
         predicted_rad: unwrapped predictions (B, N).
+
+    Returns:
+        The unwrapped angle (n,) and the shifted predictions (B, N).
     """
     whole = np.unwrap(measured_rad)
     turns = np.round((whole[np.asarray(starts, dtype=int)] - predicted_rad[:, 0]) / (2.0 * np.pi))

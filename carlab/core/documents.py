@@ -15,7 +15,10 @@ from carlab.core.quantities import Action, FloatArray, Health, Observation, Real
 
 @dataclass(frozen=True, slots=True)
 class EpisodeStarted:
-    """The first document. ``arena_m`` are corners of the geofence (n, 2); ``goal`` is (x [m], y [m], yaw [rad])."""
+    """The first document. ``goal`` is (x [m], y [m], yaw [rad]).
+
+    ``arena_m`` are corners of the geofence, and ``path_m`` points of the reference path, each (x, y).
+    """
 
     episode: int
     t_s: float
@@ -38,8 +41,9 @@ class EpisodeStarted:
 class Tick:
     """One control tick: observation, requested action and sent action.
 
-    ``features`` is the encoded observation of the policy; ``late_s`` is the lateness of the tick; ``policy_s`` is the
-    computing time of the policy; ``safety_state`` is the gate's state after the command.
+    ``features`` (7 + 2 H,) is the encoded observation of the policy (``carlab.core.observation``); ``late_s`` is the
+    lateness of the tick; ``policy_s`` is the computing time of the policy; ``safety_state`` is the gate's state after
+    the command.
     """
 
     step: int
@@ -55,7 +59,10 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One row of experience: the action sent at tick ``step`` and the observation one period later."""
+    """One row of experience: the action sent at tick ``step`` and the observation one period later.
+
+    ``features`` and ``next_features`` (7 + 2 H,) are the encoded observations before and after the action.
+    """
 
     step: int
     t_s: float

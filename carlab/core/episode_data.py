@@ -23,6 +23,9 @@ class EpisodeData:
     poses       (P, 4)       raw motion capture: capture time [s], x, y [m], yaw [rad]; P may be 0
     metadata                 texts: car, reality, policy, task, seed, end_reason, end_detail, units ...
     extra                    further columns of a foreign file by name, each (T + 1,)
+
+    Raises:
+        DataError: an array has another shape.
     """
 
     times_s: FloatArray

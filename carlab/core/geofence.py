@@ -30,7 +30,7 @@ def as_polygon(corners_m: Polygon, where: str) -> tuple[tuple[float, float], ...
 
 
 def contains(corners_m: Polygon, x_m: Any, y_m: Any) -> Any:
-    """Whether points lie inside the polygon (even-odd rule); floats, or arrays of NumPy or torch."""
+    """Whether points lie inside the polygon (even-odd rule); floats, or arrays (...) of NumPy or torch."""
     inside: Any = False
     previous_x, previous_y = corners_m[-1]
     for corner_x, corner_y in corners_m:
@@ -115,5 +115,5 @@ def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) 
 
 
 def corners_array(corners_m: Polygon) -> FloatArray:
-    """Corners as an array (n, 2)."""
+    """Corners as an array (n, 2) [m]."""
     return np.asarray(corners_m, dtype=np.float64).reshape(-1, 2)

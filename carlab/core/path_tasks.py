@@ -51,11 +51,11 @@ class _ClosedPathTask(Task):
     @property
     @abstractmethod
     def path(self) -> ClosedPath:
-        """The path with the largest distance from it at each point."""
+        """The path with the largest distance from it [m] at each point."""
 
     @property
     def path_m(self) -> Corners:
-        """Points of the path."""
+        """Points (x, y) of the path [m]."""
         return self.path.points_m
 
     @property
@@ -101,7 +101,10 @@ class _ClosedPathTask(Task):
         return 0.0 * next_features[..., 0] + 1.0 * self.terminated(next_features)
 
     def summary(self, times_s: FloatArray, states: FloatArray) -> dict[str, float]:
-        """Laps, best lap time (NaN without a lap), largest distance from the path, mean speed, and success."""
+        """Laps, best lap time [s] (NaN without a lap), largest distance from the path [m], mean speed [m/s], success.
+
+        The arguments are those of ``Task.summary``.
+        """
         travelled_m = self.path.travelled_m(states[:, :2])
         lap_times_s = lap_times(times_s, travelled_m, self.path.length_m)
         at = self.path.project(states[:, :2])

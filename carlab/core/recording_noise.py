@@ -26,6 +26,9 @@ class AdaptationNoise:
         loss_std: robust spread of the errors after the horizon of held-out errors, in the units of ``error_std``.
         feature_std: standard deviations of vx, vy [m/s], yaw rate [rad/s], steering, throttle, mean steering and mean
             throttle of a window.
+
+    Raises:
+        ConfigError: a number is not above 0.
     """
 
     error_std: StateStd
@@ -56,9 +59,13 @@ class RecordingNoise:
         measured_std: standard deviations of measured x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
         initial_state_std: the same of estimated initial states.
         velocity_window_s2: variance of the time window of the velocity columns [s2]; 0 without a window.
-        floor_std: noise floor: error of a perfect simulator after ``floor_horizon_s``; None if unknown.
+        floor_std: noise floor: error of a perfect simulator after ``floor_horizon_s``, in the units of
+            ``measured_std``; None if unknown.
         floor_horizon_s: horizon of the noise floor [s].
         adaptation: noise of the adaptation; None if the diagnosis did not adapt.
+
+    Raises:
+        ConfigError: a standard deviation is not above 0, or the variance of the time window is out of range.
     """
 
     measured_std: StateStd

@@ -36,6 +36,9 @@ class SafetyEnvelope:
     Between two observations the pose may move by ``max_speed_mps`` and turn by ``max_yaw_rate_radps`` times the time
     between them, plus the jump margins. A pose that is unchanged for ``frozen_pose_s`` while the motor turns on command
     ends the episode.
+
+    Raises:
+        ConfigError: a limit is out of range.
     """
 
     max_steering: float = 1.0
@@ -224,7 +227,12 @@ class SafeCar:
         self._frozen.reset()
 
     def command(self, requested: Action, observation: Observation, period_s: float) -> Action:
-        """Limit and send a command; returns the command sent. Raises SafetyStop if the episode must end."""
+        """Limit and send a command; returns the command sent.
+
+        Raises:
+            SafetyStop: the episode must end.
+            NotArmedError: the gate is not armed.
+        """
         now_s = self.car.clock.now_s()
         if self.state not in (SafetyState.ARMED, SafetyState.PAUSED):
             raise NotArmedError("The safety gate is not armed; call arm() first.")

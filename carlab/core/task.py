@@ -195,7 +195,7 @@ class ParkingTask(Task):
         return parked if self.stop_when_parked else parked & False
 
     def summary(self, times_s: FloatArray, states: FloatArray) -> dict[str, float]:
-        """Final distance, yaw error and speed, and 1.0 for parked."""
+        """Final distance [m], yaw error [rad] and speed [m/s], and 1.0 for parked; arguments as of ``Task``."""
         final = CarState.from_array(states[-1])
         return {
             "distance_m": math.hypot(final.x_m - self.goal[0], final.y_m - self.goal[1]),
@@ -262,7 +262,7 @@ class RecordedTask(Task):
         return 0.0 * next_features[..., 0]
 
     def summary(self, times_s: FloatArray, states: FloatArray) -> dict[str, float]:
-        """Speed at the end."""
+        """Speed [m/s] at the end; arguments as of ``Task``."""
         return {"speed_mps": CarState.from_array(states[-1]).speed_mps}
 
     def outcome(self, summary: Mapping[str, float]) -> str:

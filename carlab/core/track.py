@@ -50,7 +50,7 @@ class ClosedPath:
         """Project positions (..., 2), NumPy or torch, on the path.
 
         Args:
-            positions_m: the positions.
+            positions_m: the positions (..., 2).
             near_m: arc lengths (...,) that restrict the search to within ``reach_m``, so that crossings are
                 unambiguous.
             reach_m: the half-width of that restriction.
@@ -98,7 +98,7 @@ def _segments(path: ClosedPath) -> tuple[FloatArray, ...]:
 
 
 def wrap_length(length_m: Any, total_m: float) -> Any:
-    """Signed arc length on a closed path, in [-total / 2, total / 2)."""
+    """Signed arc length (...) [m] on a closed path, in [-total / 2, total / 2)."""
     return (length_m + 0.5 * total_m) % total_m - 0.5 * total_m
 
 

@@ -126,7 +126,7 @@ def diagnose(
 
     Raises:
         ConfigError: the simulator cannot integrate, or the held-out share or the time limit is out of range.
-        DataError: recordings too short for a network; ``Inconclusive``: no verdict, with why and what to record.
+        DataError: too few commands, or too short for a network; ``Inconclusive``: no verdict, why, what to record.
     """
     share = checked_held_out_share(holdout_share, settings.windows)
     timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)

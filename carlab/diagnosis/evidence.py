@@ -41,7 +41,7 @@ class ScoredSearch:
     """A search with the held-out errors of its models.
 
     fit      fit with the accepted effects, with covariance
-    errors   held-out errors (S, 6) of the models nominal, refit and with_effects
+    errors   held-out errors (S, 6) of the models nominal, refit and with_effects, in SI units
     is_joint whether initial states were fitted together with the parameters of ``fit``
     """
 

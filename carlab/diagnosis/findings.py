@@ -67,7 +67,10 @@ class EffectFinding:
 
 @dataclass(frozen=True, slots=True)
 class FitErrors:
-    """Root mean square held-out errors after the horizon, and the score (in noise floors)."""
+    """Root mean square held-out errors after the horizon: position, yaw, vx, vy [m/s], yaw rate [rad/s].
+
+    ``score`` is their root mean square in noise floors.
+    """
 
     position_m: float
     yaw_rad: float
@@ -301,9 +304,9 @@ def _drift_table(drift: Drift) -> dict[str, Any]:
 class Trace:
     """One held-out recording and its predictions, each restarted every horizon.
 
-    times_s (T + 1,); recorded (T + 1, 6); predicted by model (nominal, refit, with_effects), each (T + 1, 6), NaN
-    without a prediction; marked: stretches (start, end) [s] with the largest errors of the refit. A fitted recording
-    with events is a trace without predictions.
+    times_s (T + 1,) since the first row; recorded (T + 1, 6) in SI units; predicted by model (nominal, refit,
+    with_effects), each (T + 1, 6), NaN without a prediction; marked: stretches (start, end) [s] with the largest errors
+    of the refit. A fitted recording with events is a trace without predictions.
     """
 
     name: str

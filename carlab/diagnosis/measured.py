@@ -27,7 +27,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class CurveAxis:
-    """An input of a measured curve with its knots."""
+    """An input of a measured curve with its knots in ``unit``."""
 
     name: str
     unit: str
@@ -63,16 +63,18 @@ class FormFinding:
 
 @dataclass(frozen=True, slots=True)
 class CurveFinding:
-    """A measured curve and that of the car file, at the knots of its axes (an array with one dimension an axis).
+    """A measured curve and that of the car file, at the knots of its axes.
+
+    All arrays are (A,) for one axis with A knots, and (A, B) for two axes with A and B knots.
 
     Attributes:
         id: id of the curve.
         quantity: what the curve gives, in ``unit``.
         unit: its unit.
         axes: inputs.
-        car_file: the curve of the car file.
-        measured: the curve of the recordings; NaN at knots without data.
-        std: its standard deviations; NaN at knots without data.
+        car_file: the curve of the car file, in ``unit``.
+        measured: the curve of the recordings, in ``unit``; NaN at knots without data.
+        std: its standard deviations, in ``unit``; NaN at knots without data.
         support_s: driving time near each knot [s].
         form: its named form; None with too few knots.
     """

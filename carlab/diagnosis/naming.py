@@ -226,7 +226,10 @@ def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldO
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """Class statement and formula of missing physics, and the fall of each channel's squared error with it (6,)."""
+    """Class statement and formula of missing physics, and the fall of each channel's squared error with it.
+
+    ``fall`` is (6,) in squared noise floors.
+    """
 
     class_statement: str
     formula: str

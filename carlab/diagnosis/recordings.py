@@ -71,7 +71,8 @@ def split_recordings(
         keep_events: whether windows may contain events.
 
     Raises:
-        Inconclusive: too little driving, speed or variation of the commands.
+        Inconclusive: too little driving, speed or variation of the commands, or events in all windows.
+        DataError: a recording has fewer than two commands.
     """
     has_own = bool(held_out)
     marked_fit, fit_events = mark_events(fit, nominal, settings.events)

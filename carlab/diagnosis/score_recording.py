@@ -44,7 +44,7 @@ class PartScore:
     Attributes:
         part: "whole recording" or "last 30 %".
         held_out: S windows and their noise floor.
-        errors: (S, 6) of the model and of the baselines, by name.
+        errors: (S, 6) of the model and of the baselines, by name, in SI units.
         event_windows: E windows that events left out.
         event_errors: (E, 6) of the same models.
     """
@@ -73,8 +73,8 @@ class RecordingScore:
         whole: errors in the whole recording.
         last: errors in the part that a diagnosis of this recording alone holds out; None if it is too short.
         episodes: the recording, repaired.
-        overlays: predictions (T + 1, 6) at the stamps of each episode, restarted every horizon; NaN without a
-            prediction.
+        overlays: predictions (T + 1, 6) in SI units at the stamps of each episode, restarted every horizon; NaN
+            without a prediction.
         faults: faults of the recording.
         adaptation: the simulator adapted along the recording; None if that was not wanted.
         events: events of the recording.
@@ -115,8 +115,9 @@ def score_recording(
         keep_events: score windows with events (collisions) too; they are listed in any case.
 
     Raises:
-        DataError: the recording contains no window of that length in which the car moves.
-        ConfigError: the share is out of range.
+        DataError: the recording has too few commands, no window of that length in which the car moves, or an event in
+            each of these windows.
+        ConfigError: horizon, stride or share is out of range.
     """
     checked_held_out_share(holdout_share, DEFAULT.windows)
     if not all(isinstance(v, (int, float)) and 0.0 < v < math.inf for v in (horizon_s, stride_s)):

@@ -44,7 +44,7 @@ class DisturbanceSeries:
 
     Attributes:
         recording: (S,) index of the recording.
-        t_s: (S,) since the first row of the recording.
+        t_s: (S,) time since the first row of the recording.
         mean: (S, n) share of the drive force [1], steering trim [rad], share of the grip [1], force forward per mass
             [m/s2], under the condition that the car changed.
         std: (S, n) standard deviations of the same.
@@ -60,7 +60,12 @@ class DisturbanceSeries:
 
 @dataclass(frozen=True, slots=True)
 class WindowEnds:
-    """Ends of windows in the order of recording and time: ``recording`` (S,) and ``end_s`` (S,) [s]."""
+    """Ends of windows in the order of recording and time.
+
+    Attributes:
+        recording: (S,) index of the recording.
+        end_s: (S,) end of the window since the first row of its recording.
+    """
 
     recording: IndexArray
     end_s: FloatArray
@@ -103,7 +108,7 @@ class AdaptiveModel:
     settings: AdaptationSettings
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``: weighted mean of the predictions of all candidates."""
+        """As ``PredictiveModel``: weighted mean (S, K + 1, 6) of the predictions of all candidates."""
         weights = self.weights(windows.recording, windows.t0_s)
         return np.asarray(np.einsum("cs,cskj->skj", weights, self.candidates(windows)))
 
@@ -116,7 +121,12 @@ class AdaptiveModel:
         return np.concatenate([predicted, np.stack(corrected)]) if corrected else predicted
 
     def disturbances(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
-        """Estimated disturbances (C, S, n) at times of recordings, 0 before the first measured window."""
+        """Estimated disturbances (C, S, n), 0 before the first measured window; in the units of ``DisturbanceSeries``.
+
+        Args:
+            recording: (S,) index of the recording.
+            t_s: (S,) time since the first row of the recording.
+        """
         if not len(self.filter_ends.end_s):
             return np.zeros((len(self.processes.std), len(t_s), self.processes.std.shape[1]))
         index = self.filter_ends.last_before(recording, t_s - self.guard_s)
@@ -125,7 +135,12 @@ class AdaptiveModel:
         return np.where(index[:, None] >= 0, self.filtered.mean[:, index] * decay[..., None], 0.0)
 
     def weights(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
-        """Weights (1 + C + M, S) of the predictions of ``candidates`` at times of recordings."""
+        """Weights (1 + C + M, S) of the predictions of ``candidates``; they add up to 1.
+
+        Args:
+            recording: (S,) index of the recording.
+            t_s: (S,) time since the first row of the recording.
+        """
         logarithm = np.repeat(np.log(self._prior_weights())[:, None], len(t_s), axis=1)
         if len(self.weight_ends.end_s):
             index = self.weight_ends.last_before(recording, t_s - self.guard_s)

@@ -22,6 +22,8 @@ from carlab.prediction.windows import IndexArray
 class Processes:
     """Ornstein-Uhlenbeck processes and noise of C candidates.
 
+    Disturbances are in [1, rad, 1, m/s2, m/s2, rad/s2], the first n drift. Errors are in [m, m, rad, m/s, m/s, rad/s].
+
     Attributes:
         std: (C, n) stationary standard deviations, also at the start of a recording; 0 for a disturbance that is 0.
         time_constant_s: (C,).
@@ -41,6 +43,8 @@ class Processes:
 class MeasuredWindows:
     """S windows in the order of recording and time, with predictions by C candidates (or one for all).
 
+    Units are those of ``Processes``.
+
     Attributes:
         recording: (S,) index of the recording.
         end_s: (S,) end of the window since the first row of its recording.
@@ -58,7 +62,7 @@ class MeasuredWindows:
 
 @dataclass(frozen=True, slots=True)
 class Filtered:
-    """Estimates of C candidates.
+    """Estimates of the n drifting disturbances by C candidates, in the units of ``Processes``.
 
     Attributes:
         mean: (C, S, n) after each window.

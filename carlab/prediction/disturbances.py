@@ -21,14 +21,14 @@ DISTURBANCE_NAMES = (*DRIFTING_PARAMETERS, *BODY_FORCE_PARAMETERS)
 
 @dataclass(frozen=True, slots=True)
 class DisturbedModel:
-    """A simulator with constant disturbances (n,) as a predictive model."""
+    """A simulator with constant disturbances (n,) as a predictive model, with the units of ``simulate_disturbed``."""
 
     config: SimulatorConfig
     disturbances: FloatArray
     settings: AdaptationSettings
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``."""
+        """As ``PredictiveModel``: (S, K + 1, 6)."""
         constant = np.broadcast_to(self.disturbances, (1, len(windows), len(self.disturbances)))
         return np.asarray(simulate_disturbed(windows, self.config, constant, self.settings)[0])
 
@@ -36,7 +36,10 @@ class DisturbedModel:
 def linearised(
     windows: PredictionWindows, config: SimulatorConfig, at: FloatArray, settings: AdaptationSettings
 ) -> MeasuredWindows:
-    """Errors after S windows with disturbances ``at`` (C, S, n), and their Jacobian by all m disturbances."""
+    """Errors after S windows with disturbances ``at`` (C, S, n), and their Jacobian by all m disturbances.
+
+    The disturbances have the units of ``simulate_disturbed``.
+    """
     candidates, count, size = at.shape
     total = len(DISTURBANCE_NAMES)
     full = np.zeros((candidates, count, total))
@@ -70,7 +73,10 @@ def simulate_disturbed(
 
 
 def bounded_final_errors(windows: PredictionWindows, predicted: FloatArray, settings: AdaptationSettings) -> FloatArray:
-    """Errors (..., S, 6) after the windows, finite and bounded."""
+    """Errors (..., S, 6) of predictions (..., S, K + 1, 6) after the windows, finite and bounded.
+
+    Errors are x, y in the body frame [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+    """
     bound = settings.max_error
     error = prediction_errors(predicted[..., -1:, :], replace(windows, measured=windows.measured[:, -1:]))[..., 0, :]
     return np.nan_to_num(error, nan=bound, posinf=bound, neginf=-bound).clip(-bound, bound)

@@ -12,7 +12,7 @@ from carlab.prediction.predict import PredictiveModel
 from carlab.prediction.windows import IndexArray, PredictionWindows
 
 MAX_ERROR = 1e3
-"""Bound of a final error; it also replaces non-finite errors of a diverged simulator."""
+"""Bound of a final error in SI units; it also replaces non-finite errors of a diverged simulator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ def prediction_errors(predicted: FloatArray, windows: PredictionWindows, ticks: 
         ticks: indices (U,) of the predicted ticks; all K + 1 by default.
 
     Returns:
-        x and y in the body frame of each window's initial state (ahead, left), the other channels unchanged.
+        x and y [m] in the body frame of each window's initial state (ahead, left), the other channels unchanged.
     """
     error = predicted - (windows.measured if ticks is None else windows.measured[:, ticks])
     yaw = windows.initial_states[:, 2, None]
@@ -48,13 +48,13 @@ def prediction_errors(predicted: FloatArray, windows: PredictionWindows, ticks: 
 
 
 def final_errors(model: PredictiveModel, windows: PredictionWindows) -> FloatArray:
-    """Errors (S, 6) after the horizon, as ``prediction_errors``, finite and within ``MAX_ERROR``."""
+    """Errors (S, 6) of a model after the horizon, as ``prediction_errors``, finite and within ``MAX_ERROR``."""
     error = prediction_errors(model.predict(windows), windows)[:, -1]
     return np.nan_to_num(error, nan=MAX_ERROR, posinf=MAX_ERROR, neginf=-MAX_ERROR).clip(-MAX_ERROR, MAX_ERROR)
 
 
 def channel_errors(errors: FloatArray) -> tuple[ChannelError, ...]:
-    """Statistics by channel of errors (S, 6)."""
+    """Statistics by channel of errors (S, 6) of ``STATE_NAMES``, in ``STATE_UNITS``."""
     size = np.abs(errors)
     return tuple(
         ChannelError(

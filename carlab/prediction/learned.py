@@ -37,8 +37,8 @@ def sample_paths(
 
     Args:
         dynamics: the learned car with a history of H commands.
-        initial_states: (S, 6).
-        past_commands: (S, H, 2) before the first step.
+        initial_states: (S, 6) x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+        past_commands: (S, H, 2) steering and throttle before the first step.
         commands: (S, K, 2), one per step.
         n_samples: paths from each initial state.
         seed: seed of the samples.
@@ -77,7 +77,11 @@ class LearnedModel:
     seed: int = 0
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``. Raises DataError if the model's history is longer than that of the windows."""
+        """As ``PredictiveModel``, (S, K + 1, 6).
+
+        Raises:
+            DataError: the model's history is longer than that of the windows.
+        """
         return np.asarray(self.sample(windows).mean(axis=2))
 
     def sample(self, windows: PredictionWindows) -> FloatArray:
@@ -107,7 +111,7 @@ def recorded_windows(episodes: Sequence[EpisodeData], horizon_s: float, stride_s
     """Windows with the period of the recordings and initial states as recorded, to which a one-step model is fitted.
 
     Raises:
-        DataError: no recording, or the car moves in no window.
+        DataError: no recording, a recording has fewer than two commands, or the car moves in no window.
     """
     if not episodes:
         raise DataError("There is no recording to cut windows from; record a drive.")

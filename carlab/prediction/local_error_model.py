@@ -36,7 +36,7 @@ class LocalErrorModel:
         config: the simulator.
         segments: segments of the recordings that are predicted; only windows before a prediction are used.
         fitted: segments of earlier recordings, all of whose windows are used.
-        state_std: (7,) unit of the features of the state.
+        state_std: (7,) standard deviations of ``state_features``, by which these are divided.
         guard_s: minimum time [s] between the end of a used window and the start of a prediction.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
         settings: settings of the adaptation.
@@ -51,7 +51,12 @@ class LocalErrorModel:
     settings: AdaptationSettings
 
     def corrected(self, windows: PredictionWindows, predicted: FloatArray) -> FloatArray:
-        """Predictions (S, K + 1, 6) of the simulator less their expected errors."""
+        """Predictions (S, K + 1, 6) of the simulator less their expected errors.
+
+        Args:
+            windows: S windows.
+            predicted: predictions (S, K + 1, 6) of ``config``.
+        """
         past = self._windows(self.segments, windows.horizon_s)
         earlier = self._windows(self.fitted, windows.horizon_s)
         if past is None and earlier is None:
@@ -91,7 +96,10 @@ class LocalErrorModel:
 
 
 def state_features(windows: PredictionWindows) -> FloatArray:
-    """Features (S, 7) of the state of the car: body velocities, last commands, mean commands in the window."""
+    """Features (S, 7) of the state of the car: vx, vy [m/s], yaw rate [rad/s], and commands.
+
+    The commands are steering and throttle in the last step before the window, and their means in the window.
+    """
     return np.concatenate(
         [windows.initial_states[:, 3:], windows.past_commands[:, -1], windows.commands.mean(axis=1)], axis=1
     )

@@ -140,12 +140,12 @@ def train_ensemble(
         simulator: model whose discrepancy the networks learn; without it they are a black box.
         seed: seed of initial weights, batches and validation blocks.
         device: torch device.
-        velocity_window_s2: variance of the velocity window, for the initial states.
+        velocity_window_s2: variance [s2] of the velocity window, for the initial states.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the best networks so far are returned.
 
     Raises:
-        DataError: too little driving.
+        DataError: too little driving, or the car moves in no window.
     """
     settings = settings or EnsembleSettings()
     check_duration(segments, settings)

@@ -38,7 +38,11 @@ class PredictiveModel(Protocol):
     """A model that predicts the measurements in windows."""
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """Predicted measurements (S, K + 1, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate."""
+        """Predicted measurements (S, K + 1, 6) of S windows.
+
+        Returns:
+            x, y [m], yaw [rad] in the recording's frame, vx, vy [m/s] in the body frame, yaw rate [rad/s].
+        """
         ...
 
 
@@ -49,7 +53,7 @@ class SimulatorModel:
     config: SimulatorConfig
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``."""
+        """As ``PredictiveModel``, (S, K + 1, 6)."""
         return np.asarray(simulate_windows(windows, self.config)[0])
 
 
@@ -58,7 +62,7 @@ class ConstantVelocity:
     """Baseline with constant body velocities: the path is a circular arc."""
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``, from the initial state of each window."""
+        """As ``PredictiveModel``, (S, K + 1, 6) from the initial state of each window."""
         time_s = windows.period_s * np.arange(windows.steps + 1)
         x, y, yaw, vx, vy, yaw_rate = (column[:, None] for column in windows.initial_states.T)
         ahead, left, turn = arc(vx, vy, yaw_rate, time_s)
@@ -72,7 +76,7 @@ class NoChange:
     """Baseline with a constant state."""
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``."""
+        """As ``PredictiveModel``, (S, K + 1, 6)."""
         return np.repeat(windows.initial_states[:, None], windows.steps + 1, axis=1)
 
 
@@ -82,7 +86,7 @@ def predicted_at(times_s: FloatArray, windows: PredictionWindows, predicted: Flo
     Args:
         times_s: since the first row of the recording.
         windows: windows of that recording, without overlap.
-        predicted: (S, K + 1, 6).
+        predicted: predictions (S, K + 1, 6) of these windows.
     """
     found = np.full((len(times_s), 6), np.nan)
     grid = windows.period_s * np.arange(windows.steps + 1)
@@ -116,7 +120,7 @@ def simulate_windows(
         engine: of the rollouts.
 
     Returns:
-        Predicted measurements (P, S, K + 1 or U, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate.
+        Predicted measurements (P, S, K + 1 or U, 6) in the order and units of ``PredictiveModel``.
     """
     given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in (values or {}).items()}
     sets = max((len(v) for v in given.values()), default=1)
@@ -168,11 +172,12 @@ def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:
     """Second time derivative of velocities, in the body frame.
 
     Args:
-        states: (..., K + 1, 6).
+        states: (..., K + 1, 6) as of ``PredictiveModel``.
         period_s: time between states.
 
     Returns:
-        (..., K + 1, 3) by central differences of the velocities in the world; 0 at both ends.
+        (..., K + 1, 3) of vx, vy [m/s3] and yaw rate [rad/s3] by central differences of the velocities in the world; 0
+        at both ends.
     """
     rows = tuple(np.moveaxis(states, -1, 0))
     before, now, after = (tuple(r[..., part] for r in rows) for part in (np.s_[:-2], np.s_[1:-1], np.s_[2:]))

@@ -47,9 +47,9 @@ class RecordingSegment:
         recording: index of the recording.
         period_s: period of the grid.
         t_s: (n,) time since the first row of the recording.
-        states: (n, 6) as measured, yaw unwrapped.
+        states: (n, 6) x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s] as measured, yaw unwrapped.
         smooth: (n, 6) pose of a local cubic through the poses, and the body velocities of that cubic.
-        commands: (n, 2) mean of the held commands over each cell of the grid.
+        commands: (n, 2) mean of the held steering and throttle over each cell of the grid.
         residual: (m, 6) states minus their local cubic while the car moves, at the period ``sampled_s``.
         speed: (m,) at the rows of ``residual`` [m/s].
         curvature_bias: (n, 6) states of a local quintic minus ``smooth``.
@@ -93,9 +93,10 @@ class PredictionWindows:
 
     Attributes:
         period_s: length of a step.
-        initial_states: (S, 6) x, y, yaw in the recording's frame, vx, vy in the body frame, yaw rate.
-        past_commands: (S, H, 2) before the window.
-        commands: (S, K, 2) in the window.
+        initial_states: (S, 6) x, y [m], yaw [rad] in the recording's frame, vx, vy [m/s] in the body frame, yaw rate
+            [rad/s]; other states have the same columns.
+        past_commands: (S, H, 2) steering and throttle before the window.
+        commands: (S, K, 2) steering and throttle in the window.
         measured: (S, K + 1, 6) states as recorded, yaw unwrapped.
         past_states: (S, H, 6) smoothed states before the window.
         curvature_bias: (S, 6) initial state by a local quintic minus that by the local cubic.
@@ -136,7 +137,7 @@ class PredictionWindows:
         return self.steps * self.period_s
 
     def take(self, which: NDArray[np.bool_] | IndexArray) -> Self:
-        """Select windows."""
+        """Select windows by a mask (S,) or by indices (n,)."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         chosen: dict[str, Any] = {name: v[which] for name, v in values.items() if isinstance(v, np.ndarray)}
         return replace(self, **chosen)
@@ -253,7 +254,7 @@ def _smoothed(states: FloatArray, width: int, order: int, period_s: float) -> Fl
 
 
 def body_states(pose: FloatArray, rate: FloatArray) -> FloatArray:
-    """States (n, 6) of poses (n, 3) and their rates in the world (n, 3)."""
+    """States (n, 6) of poses (n, 3) [m, m, rad] and their rates in the world (n, 3) [m/s, m/s, rad/s]."""
     return np.column_stack([pose, *to_body(rate[:, 0], rate[:, 1], pose[:, 2]), rate[:, 2]])
 
 

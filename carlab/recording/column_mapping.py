@@ -56,7 +56,7 @@ class ColumnSource:
     """Any further factor, for example 0.04 for steering in [-25, 25]."""
 
     def factor(self, channel: str) -> float:
-        """Factor from the column to the channel's SI unit. Raises ConfigError for an unknown unit."""
+        """Factor from the column to the channel's SI unit. Raises ConfigError for an unknown unit or a scale of 0."""
         units = UNITS[channel]
         if not (math.isfinite(self.scale) and self.scale != 0.0):
             raise ConfigError(f"The scale of {channel} is {self.scale:g}; give a finite number other than 0.")
@@ -69,7 +69,11 @@ class ColumnSource:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMapping:
-    """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``."""
+    """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``.
+
+    Raises:
+        ConfigError: an unknown channel or unit, or a scale or rate that is out of range.
+    """
 
     columns: Mapping[str, ColumnSource]
     layout: str = "custom"
@@ -84,14 +88,14 @@ class ColumnMapping:
     swap_xy: bool = False
     """Exchange x and y (and vx and vy in the world frame)."""
     yaw_offset_rad: float = 0.0
-    """Added to yaw after unit and sign."""
+    """Added to yaw [rad] after unit and sign."""
     repair_yaw_rate: bool = False
     """Replace rows of yaw_rate that hold a wrapped-angle spike by the turn rate of the pose."""
     throttle_gate: str | None = None
     """Column that multiplied the throttle on the car: ``requested`` keeps the column, ``sent`` is the product."""
     references: Mapping[str, str] = field(default_factory=dict)
-    """Further sensor columns that measure a state channel again, for example ``{"vel encoder" = "vx"}``: only
-    compared."""
+    """Further sensor columns that measure a state channel again, for example ``{"vel encoder" = "vx"}``; they are only
+    compared with it."""
     dead_reckoning: bool = False
     """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
     clock: Literal["column", "velocity", "even"] = "column"
@@ -100,7 +104,7 @@ class ColumnMapping:
     command_lag_s: float = 0.0
     """Known delay of the command columns behind the moment at which the commands were sent [s]."""
     rate_hz: float | None = None
-    """Row rate of a file without a time column."""
+    """Row rate [Hz] of a file without a time column."""
     missing: Literal["error", "drop"] = "error"
     """Rows with a value missing: refuse, or leave them out (the command before is then held across them)."""
     gaps: Literal["error", "split", "keep"] = "error"

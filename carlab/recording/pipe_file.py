@@ -37,7 +37,7 @@ class PipeFile:
         self._file = self._path.open("xb", buffering=0)
 
     def start(self) -> Path:
-        """Start copying; returns the path that the writer must open."""
+        """Start copying; returns the path that the writer must open. Raises OSError before ``open``."""
         if self._file is None:
             raise OSError(f"{self._path} is not open")
         self._ends = os.pipe()

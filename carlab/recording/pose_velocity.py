@@ -27,7 +27,15 @@ _JUMP_RAD, _JUMP_ANGULAR = 0.3, 500.0
 
 @dataclass(frozen=True, slots=True)
 class PoseMotion:
-    """Motion of the pose itself. All (N,); world-frame speed, and speed in the frame of ``yaw``."""
+    """Motion of the pose itself; arrays are (N,).
+
+    Attributes:
+        yaw_unwrapped: yaw without jumps of 2 pi [rad].
+        vx_world, vy_world: velocities in the world frame [m/s].
+        vx, vy: velocities in the body frame [m/s].
+        yaw_rate: derivative of the yaw [rad/s].
+        half_rows: rows on either side of a row in the local quadratic.
+    """
 
     yaw_unwrapped: FloatArray
     vx_world: FloatArray
@@ -46,7 +54,7 @@ class PoseMotion:
 
 
 def pose_jumps(t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> IndexArray:
-    """Row indices k, shape (J,), at which the step from row k - 1 to k exceeds the motion of a car."""
+    """Row indices k, shape (J,), at which the step from row k - 1 to k exceeds a car's motion; arguments (N,)."""
     dt = np.diff(t_s)
     safe = np.where(dt > 0, dt, np.nan)
     steps = np.stack([np.diff(x_m), np.diff(y_m), wrap(np.diff(yaw_rad))])

@@ -82,7 +82,7 @@ class RunDirectory:
 
     @classmethod
     def open_existing(cls, path: Path | str) -> Self:
-        """Resume a run. Raises DataError if ``path`` is no run's folder."""
+        """Resume a run. Raises DataError if ``path`` is no run's folder or cannot be written."""
         path = Path(path)
         if not (path / "environment.json").is_file():
             raise DataError(
@@ -141,7 +141,11 @@ class RunDirectory:
         return sorted(entry for entry in self.episodes.iterdir() if entry.name.endswith(ends))
 
     def log_handler(self, level: int = logging.INFO) -> logging.Handler:
-        """A logging handler that appends to log.jsonl; the caller adds, removes and closes it."""
+        """A logging handler that appends to log.jsonl; the caller adds, removes and closes it.
+
+        Raises:
+            DataError: the file cannot be opened.
+        """
         try:
             handler = _LogFile(self.path / "log.jsonl", encoding="utf-8", errors="backslashreplace")
         except OSError as error:

@@ -107,7 +107,7 @@ class Sink(ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Pass everything written so far to the operating system, so that a kill loses none of it."""
+        """Pass everything written so far to the system, so that a kill loses none. Raises OSError if that fails."""
 
     @abstractmethod
     def abandon(self) -> None:
@@ -155,7 +155,10 @@ class Sink(ABC):
             self._finished = True
 
     def close(self, reason: EndReason = EndReason.CRASHED, detail: str = "") -> None:
-        """Complete the file. An episode that has not ended is marked with ``reason``. Idempotent."""
+        """Complete the file. An episode that has not ended is marked with ``reason``. Idempotent.
+
+        Raises the errors of ``write``.
+        """
         if self._finished:
             return
         if self._started is None:

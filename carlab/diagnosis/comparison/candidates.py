@@ -91,7 +91,7 @@ def candidate_points(
 
 
 def size_of(candidate: ChangeCandidate, z: FloatArray, z0: FloatArray) -> FloatArray:
-    """Change of each parameter's value (n,) from coordinates ``z0`` to ``z``, without bounds."""
+    """Change of each parameter's value (n,) from coordinates ``z0`` to ``z``, both (n,), without bounds."""
     return np.array([
         f.origin * (math.exp(f.size * a) - math.exp(f.size * b)) if f.logarithmic else f.size * (a - b)
         for f, a, b in zip(candidate.free, z, z0, strict=True)

@@ -25,7 +25,7 @@ SCATTER_ITERATIONS = 20
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """Student-t distribution of errors (S, D); ``root`` (D, D) decorrelates them."""
+    """Student-t distribution of errors (S, D) with ``dof`` degrees of freedom; ``root`` (D, D) decorrelates them."""
 
     root: FloatArray
     dof: float
@@ -59,7 +59,7 @@ class ErrorModel:
         return np.asarray((self.dof + decorrelated.shape[-1]) / (self.dof + distance_sq))
 
     def loss(self, decorrelated: FloatArray) -> FloatArray:
-        """Negative log-likelihood (...) of windows, without the constant of this model."""
+        """Negative log-likelihood (...) of windows by their decorrelated errors (..., D), without its constant."""
         distance_sq = (decorrelated**2).sum(axis=-1)
         return np.asarray(0.5 * (self.dof + decorrelated.shape[-1]) * np.log1p(distance_sq / self.dof))
 

@@ -51,7 +51,11 @@ class ComparedGroups:
         return self.error_models.whole
 
     def decorrelated(self, of_groups: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Errors (..., S, D) of each group in standard deviations along independent directions."""
+        """Errors (..., S, D) of each group in standard deviations along independent directions.
+
+        Args:
+            of_groups: whitened errors (..., S, D) of the first and of the second group.
+        """
         first, second = of_groups
         return self.error_models.decorrelated(first), self.model.decorrelated(second)
 

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Secants:
-    """A candidate with its decorrelated secants (P, S, D) in both groups."""
+    """A candidate with its decorrelated secants ``of_group``, (P, S, D) in each of the two groups."""
 
     at: CandidatePoints
     of_group: tuple[FloatArray, FloatArray]
@@ -41,7 +41,14 @@ class Secants:
         settings: ComparisonSettings,
         known: Sequence[FloatArray],
     ) -> LinearChange | None:
-        """The point with the largest likelihood ratio; None without a usable one."""
+        """The point with the largest likelihood ratio; None without a usable one.
+
+        Args:
+            groups: errors of both groups.
+            model: distribution of the errors.
+            settings: settings of the comparison.
+            known: decorrelated Jacobians (S, D) of changes of the second group that are already known.
+        """
         found = []
         for k in range(len(self.at.points)):
             own = [g[k] for g in self.of_group]
@@ -61,7 +68,7 @@ class LinearChange:
 
     @property
     def z(self) -> FloatArray:
-        """Estimated coordinates of the second group."""
+        """Estimated coordinates (n,) of the second group."""
         at = self.secants.at
         return np.asarray(at.z0 + self.difference.step * (at.points[self.point] - at.z0))
 

@@ -25,7 +25,7 @@ SLOW_MPS = 0.1
 
 @dataclass(frozen=True, slots=True)
 class FormParameter:
-    """A parameter of a form: name in the text, unit, values at which a fit starts, and bounds."""
+    """A parameter of a form: name in the text, unit, values at which a fit starts, and bounds, both in ``unit``."""
 
     name: str
     unit: str
@@ -36,7 +36,10 @@ class FormParameter:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A named form: id, a noun phrase, its parameters, and the function of parameters and inputs."""
+    """A named form: id, a noun phrase, its parameters, and the function of parameters and inputs.
+
+    ``function`` receives the p parameters, then the inputs; their shapes broadcast.
+    """
 
     id: str
     name: str
@@ -44,18 +47,26 @@ class Form:
     function: Callable[..., FloatArray]
 
     def value(self, parameters: FloatArray, inputs: tuple[FloatArray, ...]) -> FloatArray:
-        """Values at inputs of one shape; parameters may have axes before those of the inputs."""
+        """Values of the form.
+
+        Args:
+            parameters: (p,), or (p, m, 1) for m sets; with a further axis of length 1 for inputs (A, B).
+            inputs: each (n,), or each (A, B).
+
+        Returns:
+            (n,) or (A, B); (m, n) or (m, A, B) for m sets.
+        """
         sets = np.broadcast_shapes(*(np.shape(p) for p in parameters), inputs[0].shape)
         return np.broadcast_to(self.function(*parameters, *inputs), sets)
 
 
 def dead_band(x: FloatArray, width: float) -> FloatArray:
-    """0 within the band, stretched outside so that 1 stays 1 (as the effect ``throttle_deadband``)."""
+    """0 within the band, stretched outside so that 1 stays 1 (as the effect ``throttle_deadband``); ``x`` (...)."""
     return np.asarray(np.sign(x) * np.maximum(np.abs(x) - width, 0.0) / (1.0 - width))
 
 
 def power(x: FloatArray, exponent: float) -> FloatArray:
-    """``sign(x) |x|^exponent``."""
+    """``sign(x) |x|^exponent``, element by element of ``x`` (...)."""
     return np.asarray(np.sign(x) * np.abs(x) ** exponent)
 
 

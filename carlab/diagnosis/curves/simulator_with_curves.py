@@ -44,7 +44,8 @@ def simulator_with_curves(
         delay.
 
     Raises:
-        Inconclusive: too little driving, speed or variation of the commands.
+        Inconclusive: too little driving, speed or variation of the commands, or events in all windows.
+        DataError: a recording has fewer than two commands.
     """
     nominal = with_known_latency(nominal, episodes)
     repaired, _, _ = data_faults_of.check(episodes, (), nominal)

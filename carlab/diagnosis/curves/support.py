@@ -67,7 +67,10 @@ def without_extrapolation(found: CurveFit, segments: tuple[RecordingSegment, ...
 
 
 def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, segments: tuple[RecordingSegment, ...]) -> FloatArray:
-    """Driving time [s] near each knot: each row counts with its interpolation weights."""
+    """Driving time [s] near each knot, (A,) or (A, B) for one or two axes with A and B knots.
+
+    Each row of the segments counts with its interpolation weights.
+    """
     total = np.zeros([len(axis.knots) for axis in curve.axes])
     for segment in segments:
         coordinates = curve.coordinates(ARRAYS, recorded_forces(segment, config))
@@ -81,7 +84,7 @@ def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, segments: tupl
 
 
 def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Forces:
-    """State, delayed commands and longitudinal force of a recording, as inputs of curves.
+    """State, delayed commands and longitudinal force [N] of the n rows of a recording, as inputs (n,) of curves.
 
     The first command is held before the recording begins, because earlier commands are unknown.
     """

@@ -27,7 +27,10 @@ from sim_backends.effects import CURVES
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Standard deviations that whiten errors: ``sigma`` (U, 6) by step and channel, and the ``steps`` (U,)."""
+    """Standard deviations that whiten errors: ``sigma`` (U, 6) by step and channel, and the ``steps`` (U,).
+
+    ``sigma`` has the units of the errors: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+    """
 
     steps: np.ndarray
     sigma: FloatArray
@@ -57,13 +60,13 @@ _MAX_WHITE = 1e4
 
 
 def bounded(white: FloatArray) -> FloatArray:
-    """Whitened errors of which none is infinite or NaN, as those of a diverged simulation are."""
+    """Whitened errors (...) of which none is infinite or NaN, as those of a diverged simulation are."""
     finite = np.nan_to_num(white, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
     return finite.clip(-_MAX_WHITE, _MAX_WHITE)
 
 
 def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
-    """Huber's loss, element by element."""
+    """Huber's loss of whitened errors (...), element by element; it is linear from ``delta`` on."""
     size = np.abs(white)
     return np.where(size <= delta, 0.5 * white**2, delta * size - 0.5 * delta**2)
 
@@ -113,7 +116,7 @@ class Fitter:
         self.settings = settings
 
     def huber(self, white: FloatArray) -> FloatArray:
-        """Huber's loss of whitened errors, element by element."""
+        """Huber's loss of whitened errors (...), element by element."""
         return huber(white, self.settings.huber_delta)
 
     def white(self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray) -> FloatArray:

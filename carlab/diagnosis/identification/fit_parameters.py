@@ -69,7 +69,7 @@ class FitParameter:
         return DELAY_DIFFERENCE_STEP if self.is_delay else DIFFERENCE_STEP
 
     def value(self, z: FloatArray) -> FloatArray:
-        """Values at coordinates z."""
+        """Values at coordinates z, both (...)."""
         if self.choice:
             return np.asarray(np.round(np.clip(z, self.low, self.high)))
         raw = self.origin * np.exp(self.size * z) if self.logarithmic else self.origin + self.size * z

@@ -27,7 +27,7 @@ class HeldOut:
     Attributes:
         windows: S held-out prediction windows.
         floor: (6,) error of a perfect simulator after the horizon, estimated from the recording: measurement noise at
-            the end, and the propagated error of the initial state.
+            the end, and the propagated error of the initial state; x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
         noise: noise of the recordings that were fitted.
         huber_delta: error, over its robust standard deviation, from which Huber's loss is linear.
     """
@@ -56,7 +56,7 @@ class HeldOut:
         return replace(noise, floor_std=floor, floor_horizon_s=self.windows.horizon_s)
 
     def final_error(self, model: SimulatorConfig | PredictiveModel) -> FloatArray:
-        """Errors (S, 6) of a model after the horizon."""
+        """Errors (S, 6) of a model after the horizon, in SI units, as ``prediction_errors``."""
         return final_errors(SimulatorModel(model) if isinstance(model, SimulatorConfig) else model, self.windows)
 
     def score(self, error: FloatArray) -> float:
@@ -91,7 +91,7 @@ class HeldOut:
 
     @staticmethod
     def fingerprint(without: FloatArray, with_it: FloatArray) -> dict[str, float]:
-        """Relative increase of each channel's rms error when an effect is removed."""
+        """Relative increase of each channel's rms error when an effect is removed; both errors (S, 6)."""
         before, after = (np.sqrt(np.mean(e**2, axis=0)) for e in (without, with_it))
         return {name: float(b / max(a, 1e-12) - 1.0) for name, a, b in zip(STATE_NAMES, after, before, strict=True)}
 

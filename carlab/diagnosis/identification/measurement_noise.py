@@ -23,7 +23,10 @@ from carlab.prediction.windows import MIN_QUINTIC_WIDTH, RecordingSegment, smoot
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations (6,) of measured x, y, yaw, vx, vy, yaw rate and of estimated initial states."""
+    """Standard deviations (6,) of ``measured`` channels, and (6,) of the estimated ``initial_state``.
+
+    Both are in the order x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+    """
 
     measured: FloatArray
     initial_state: FloatArray

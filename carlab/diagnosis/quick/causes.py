@@ -132,7 +132,7 @@ def find_causes(
 
 
 def scale_of(windows: PredictionWindows, floor: FloatArray, settings: QuickSettings) -> Scale:
-    """Steps whose errors enter a fit, with their noise floor."""
+    """Steps whose errors enter a fit, with their noise floor; ``floor`` (K + 1, 6) is that along a window."""
     steps = np.unique(np.linspace(windows.steps / settings.used_steps, windows.steps, settings.used_steps).round())
     steps = steps.astype(int)
     return Scale(steps, floor[steps])

@@ -24,11 +24,11 @@ class EpisodeRepair:
     Attributes:
         episode: the recording before repair.
         times_s: stamps (N,).
-        states: states (N, 6).
-        commands: sent commands (N, 2); that of the last row is never executed.
+        states: states (N, 6): x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+        commands: sent commands (N, 2), steering and throttle; that of the last row is never executed.
         segment: number of the unbroken stretch (N,).
         rows: indices (N,) of the remaining rows in the recording.
-        interpolated: rows (N,) whose pose was interpolated.
+        interpolated: whether the pose of a row was interpolated (N,).
         has_velocity_columns: False if the velocities are estimated from the pose.
         faults: faults found, with the action taken.
         is_changed: whether anything was repaired.
@@ -79,7 +79,7 @@ class EpisodeRepair:
         return len(jumps)
 
     def keep(self, rows: BoolArray) -> None:
-        """Keep the selected rows (N,). The previous command is held across gaps."""
+        """Keep the rows of a mask (N,). The previous command is held across gaps."""
         self.is_changed = True
         self.times_s, self.states, self.commands = self.times_s[rows], self.states[rows], self.commands[rows]
         self.segment, self.rows, self.interpolated = self.segment[rows], self.rows[rows], self.interpolated[rows]
@@ -100,7 +100,12 @@ class EpisodeRepair:
         self.report(fault.id, fault.channel, count, f"repaired: {fault.observation}; {remedy}.")
 
     def retime(self, channel: int, later_s: FloatArray | float) -> None:
-        """Delay a command column: its value at t becomes that at t - ``later_s``."""
+        """Delay a command column: its value at t becomes that at t - ``later_s``.
+
+        Args:
+            channel: 0 for steering, 1 for throttle.
+            later_s: delay [s]; one number, or one for each row (N,).
+        """
         self.is_changed = True
         begin = self.times_s - later_s
         self.commands[:, channel] = held_means(

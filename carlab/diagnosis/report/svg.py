@@ -87,7 +87,10 @@ class Chart:
         return self._size[1] - self._bottom - (y - low) / (high - low) * (self._size[1] - self._top - self._bottom)
 
     def line(self, x: FloatArray, y: FloatArray, style: str, breaks: Sequence[int] = ()) -> None:
-        """Draw a line, broken at NaN and before each row of ``breaks``; long lines are thinned."""
+        """Draw a line through n points, ``x`` and ``y`` (n,); long lines are thinned.
+
+        The line is broken at NaN and before each row of ``breaks``.
+        """
         every = max(len(x) // MAX_LINE_POINTS, 1)
         broken = set(breaks)
         pieces: list[str] = []
@@ -102,7 +105,7 @@ class Chart:
             self._front.append(f'<path class="line {style}" d="{"".join(pieces)}"/>')
 
     def dots(self, x: FloatArray, y: FloatArray, style: str, radius: float = 3.0) -> None:
-        """A dot at each finite point."""
+        """Draw a dot of ``radius`` [px] at each finite point; ``x`` and ``y`` (n,)."""
         for a, b in zip(x, y, strict=True):
             if math.isfinite(a) and math.isfinite(b):
                 self._front.append(
@@ -110,7 +113,7 @@ class Chart:
                 )
 
     def stems(self, x: FloatArray, y: FloatArray, style: str) -> None:
-        """A line from zero to each finite point."""
+        """Draw a line from zero to each finite point; ``x`` and ``y`` (n,)."""
         for a, b in zip(x, y, strict=True):
             if math.isfinite(a) and math.isfinite(b):
                 self._front.append(

@@ -30,8 +30,8 @@ class SearchProblem:
 
     nominal       simulator of the car file; its effects stay, and their parameters are fitted
     windows       windows of the recordings to fit
-    floor   (6,)  standard deviation of each channel's error of a perfect simulator
-    measured_std  standard deviations (6,) of the noise of the measured channels
+    floor   (6,)  standard deviation of each channel's error of a perfect simulator, in SI units
+    measured_std  standard deviations (6,) of the noise of the measured channels, in SI units
     confusable    confusable effects by effect id
     candidates    effects that may be accepted
     refits        models of earlier refits (``selection.refit``)
@@ -68,7 +68,7 @@ class SearchProblem:
         return config
 
     def nominal_coordinates(self, free: Sequence[FitParameter]) -> FloatArray:
-        """Coordinates of ``free`` at the values of the car file; 0 without a value."""
+        """Coordinates (n,) of n parameters at the values of the car file; 0 without a value."""
         values = self.nominal.values()
         return np.array([f.coordinate(values[f.name]) if f.name in values else 0.0 for f in free])
 

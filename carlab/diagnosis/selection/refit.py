@@ -83,7 +83,15 @@ def fit_with_scale(
     free: tuple[FitParameter, ...],
     start: FloatArray,
 ) -> Model:
-    """Alternate fits and estimates of the error scale until the scale converges."""
+    """Alternate fits and estimates of the error scale until the scale converges.
+
+    Args:
+        problem: the search problem.
+        effects: ids of the effects in ``config``, for the result.
+        config: simulator with the effects.
+        free: n parameters to fit.
+        start: their coordinates (n,) at the start.
+    """
     settings, identification = problem.settings.selection, problem.settings.identification
     windows, floor = problem.windows, problem.floor
     scale = Scale.of(

@@ -45,7 +45,7 @@ class ChosenTerm:
 class ResidualModel:
     """Significant unnamed terms.
 
-    fall  (6,)  predicted fall of the mean squared error at the ends of windows, in squared units
+    fall  (6,)  predicted fall of the mean squared error at the ends of windows, in squared SI units
     """
 
     chosen: tuple[ChosenTerm, ...]

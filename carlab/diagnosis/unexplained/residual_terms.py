@@ -25,7 +25,10 @@ Features = dict[str, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """A term of the library: formula, class statement, inputs, and its value as a function of features."""
+    """A term of the library: formula, class statement, inputs, and its value as a function of features.
+
+    The value is an array of the shape of each feature, (S, J).
+    """
 
     formula: str
     statement: str
@@ -130,9 +133,11 @@ TERMS: tuple[Term, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Responses:
-    """Changes of the whitened errors by impulses: matrix (3, J, S, U, 6) per unit of velocity; features (S, J) each.
+    """Changes of the whitened errors by J impulses on vx, vy and yaw rate.
 
-    ``span_s`` is the time between impulses.
+    matrix    (3, J, S, U, 6) change per unit of velocity [1 / (m/s), 1 / (m/s), 1 / (rad/s)]
+    features  inputs of the terms at the impulses, each (S, J)
+    span_s    time between impulses
     """
 
     matrix: FloatArray
@@ -140,7 +145,12 @@ class Responses:
     span_s: float
 
     def of(self, term: Term, channel: int) -> FloatArray:
-        """Change of the whitened errors (S, U, 6) by one unit of a term as acceleration on vx, vy or yaw rate."""
+        """Change of the whitened errors (S, U, 6) by one unit of a term as acceleration on vx, vy or yaw rate.
+
+        Args:
+            term: the term.
+            channel: 0 for vx [m/s2], 1 for vy [m/s2], 2 for yaw rate [rad/s2].
+        """
         value = term.value(self.features) * self.span_s
         return np.asarray(np.einsum("sj,jsuc->suc", value, self.matrix[channel]))
 
@@ -191,7 +201,18 @@ def _remainder(windows: PredictionWindows, predicted: FloatArray, begin: int, st
 
 
 def features(windows: PredictionWindows, predicted: FloatArray, config: SimulatorConfig, at: np.ndarray) -> Features:
-    """Inputs of the terms, each (S, J) at steps ``at`` (J,): commands after delays, motion, place and time."""
+    """Inputs of the terms, each (S, J): commands after delays, motion, place and time.
+
+    v, w, r: vx, vy [m/s], yaw rate [rad/s]; d, u: steering, throttle; d before, u before: the same 0.3 s earlier; dd,
+    du: their rates [1/s]; yaw [rad]; x, y [m]; t: time as a share of the recording; work: mean lateral acceleration
+    before the window over 3 m/s2.
+
+    Args:
+        windows: S windows.
+        predicted: predicted states (S, K + 1, 6).
+        config: the simulator, for the delay of the commands.
+        at: steps (J,).
+    """
     period_s, past = windows.period_s, windows.past_commands.shape[1]
     commands = np.concatenate([windows.past_commands, windows.commands], axis=1)
     age_s = config.command_delay_s + config.mocap.latency_s

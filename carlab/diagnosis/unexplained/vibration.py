@@ -30,8 +30,8 @@ FREQUENCIES_HZ = np.arange(1.0, 25.0, 0.1)
 class Vibration:
     """A spectral line in x, y, yaw, vx, vy, yaw rate.
 
-    periods_per_m     spatial frequency
-    amplitude   (6,)  at the median speed, in the channel's unit; a lower bound
+    periods_per_m     spatial frequency [1/m]
+    amplitude   (6,)  at the median speed, in the channel's SI unit; a lower bound
     ratio       (6,)  power over the mean power of all lines
     min_ratio         ratio at which a channel counts as vibrating
     """

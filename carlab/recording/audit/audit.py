@@ -53,8 +53,8 @@ SIGN_REMEDIES = {
 class Channels:
     """A recording's columns after conversion of units, signs and axes by the mapping, before any change of frame.
 
-    ``values`` by channel and ``extra`` by column name are (N,); ``segment`` numbers the parts without a gap or jump;
-    ``motion`` is None without a pose.
+    ``t_s``, ``values`` by channel (SI units), ``extra`` by column name, and ``segment`` are (N,). ``segment`` numbers
+    the parts without a gap or jump. ``motion`` is None without a pose.
     """
 
     t_s: FloatArray
@@ -93,7 +93,7 @@ def audit_channels(channels: Channels, mapping: ColumnMapping) -> tuple[list[Fin
 
 
 def check_heading(t_s: FloatArray, values: Mapping[str, FloatArray], mapping: ColumnMapping) -> list[Finding]:
-    """Check unit, sign and axis of the yaw by the course over ground. ``values`` holds x, y and yaw (N,)."""
+    """Check unit, sign and axis of the yaw by the course over ground. ``values`` has x, y [m], yaw [rad], each (N,)."""
     return [_finding(fault, mapping) for fault in heading_faults(t_s, values)]
 
 

@@ -33,6 +33,7 @@ MAX_COMMAND = 1.05
 def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
     """Find empty, non-finite or too large cells. Returns findings and the mask of complete rows (N,).
 
+    ``values`` are the columns (N,) by channel.
     Commands of the last row are never executed, so they may be missing.
     """
     rows = len(values["t"])
@@ -67,7 +68,7 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
 
 
 def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
-    """Find stamps that repeat or go back. Returns findings and the mask of rows that advance, shape (N,)."""
+    """Find stamps (N,) that repeat or go back. Returns findings and the mask of rows that advance, shape (N,)."""
     advances = t_s > np.maximum.accumulate(np.concatenate([[-np.inf], t_s[:-1]]))
     if advances.all():
         return [], advances
@@ -178,7 +179,7 @@ def _check_jitter(t_s: FloatArray, gaps: IndexArray) -> list[Finding]:
 
 
 def check_held(t_s: FloatArray, columns: Mapping[str, FloatArray]) -> list[Finding]:
-    """Columns that change only every few rows: a slow source repeated in fast rows. One finding a hold length."""
+    """Columns (N,) that change only every few rows: a slow source repeated in fast rows. One finding a hold length."""
     held: dict[int, list[str]] = {}
     for name, column in columns.items():
         edges = np.flatnonzero(np.concatenate([[True], np.diff(column) != 0, [True]]))
@@ -212,7 +213,7 @@ def _count(repeats: BoolArray) -> str:
 
 
 def check_stale(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Finding]:
-    """Rows that repeat the pose before while the car moves."""
+    """Rows that repeat the pose before while the car moves; ``values`` has x, y and yaw, each (N,)."""
     stale = stale_rows(t_s, np.column_stack([values[name] for name in POSE_CHANNELS]))
     if not stale.any():
         return []
@@ -227,7 +228,7 @@ def check_stale(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Findi
 def check_jumps(
     t_s: FloatArray, values: Mapping[str, FloatArray], jumps: IndexArray, mapping: ColumnMapping
 ) -> list[Finding]:
-    """Steps of the pose that no car makes. ``jumps`` (J,) as ``pose_jumps`` returns them."""
+    """Steps of the pose that no car makes; ``values`` has x, y and yaw (N,), ``jumps`` (J,) is of ``pose_jumps``."""
     if not len(jumps):
         return []
     step = float(np.hypot(np.diff(values["x"]), np.diff(values["y"]))[jumps - 1].max())
@@ -246,7 +247,7 @@ def check_jumps(
 
 
 def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> list[Finding]:
-    """Commands beyond [-1, 1], and commands that never change. The last row's command is not executed."""
+    """Commands (N,) beyond [-1, 1], and commands that never change. The last row's command is not executed."""
     findings = []
     for channel in COMMAND_CHANNELS:
         column = values[channel][:-1]
@@ -287,7 +288,7 @@ def _rounded_down(value: float) -> str:
 
 
 def check_gate(throttle: FloatArray, gate: FloatArray, name: str) -> list[Finding]:
-    """Rows whose throttle did not reach the motor because the gate column (N,) is not 1."""
+    """Rows whose throttle (N,) did not reach the motor because the gate column (N,) is not 1."""
     inert = (throttle != 0) & (gate != 1) & np.isfinite(throttle)
     if not inert.any():
         return []

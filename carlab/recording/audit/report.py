@@ -61,7 +61,7 @@ class Finding:
         evidence: Mapping[str, float] | None = None,
         option: str | None = None,
     ) -> Finding:
-        """A finding about rows, given by indices (from 0) or a mask."""
+        """A finding about rows, given by indices (n,) from 0 or a mask (N,)."""
         indices = np.flatnonzero(rows) if rows.dtype == bool else rows
         numbers = tuple(int(k) + 1 for k in indices[:MAX_ROWS])
         return cls(identity, channel, severity, sentence, len(indices), numbers, evidence or {}, option)

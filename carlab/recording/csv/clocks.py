@@ -19,7 +19,11 @@ _MEDIAN_FILTER_ROWS = 51
 
 
 def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
-    """Stamps (N,) [s] from distance over speed, with the median period below 0.3 m/s, and a note about them."""
+    """Stamps (N,) [s] from distance over speed, with the median period below 0.3 m/s, and a note about them.
+
+    Raises:
+        DataError: there are no vx and vy columns, or the car hardly moves.
+    """
     if "vx" not in channels.values or "vy" not in channels.values:
         raise DataError("The clock cannot be rebuilt without vx and vy columns; use --clock column.")
     periods_s = channels.periods_s()

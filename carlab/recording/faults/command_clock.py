@@ -35,7 +35,7 @@ class WindowLags:
 
 
 def window_lags(responses: Sequence[CommandResponse | None]) -> WindowLags:
-    """Delays of steering and throttle in windows of a recording."""
+    """Delays of steering and throttle in windows of a recording; ``responses`` are those of steering and throttle."""
     parts = []
     for channel, response in enumerate(responses):
         if response is None or response.best < LIMITS.command_explained[channel]:

@@ -38,7 +38,7 @@ class CommandResponse:
         time_constant_s: of the first-order lag there [s].
         gain: slope of the explained part over the command: [rad/m] for steering, [m/s^2] for throttle.
         t_s: stamps of the rows used (n,).
-        target: yaw rate or acceleration there (n,), residual of its regression on the speed.
+        target: yaw rate [rad/s] or acceleration [m/s2] there (n,), residual of its regression on the speed.
         predicted: the same by the command at each lag (L, n), with the coefficients of the best lag.
     """
 
@@ -63,9 +63,10 @@ class CommandResponse:
 
 @dataclass(frozen=True, slots=True)
 class GridMotion:
-    """Velocities and forward acceleration on an even grid (n,); ``rows`` (n,) are those to fit.
+    """Velocities and forward acceleration on an even grid of n rows.
 
-    spans_s are the widths over which the velocities and, again, the acceleration were averaged.
+    ``t_s``, ``vx`` [m/s], ``yaw_rate`` [rad/s], ``acceleration`` [m/s2] and ``rows``, the rows to fit, are (n,).
+    ``spans_s`` are the widths over which the velocities and, again, the acceleration were averaged.
     """
 
     t_s: FloatArray
@@ -78,7 +79,13 @@ class GridMotion:
 
 
 def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> GridMotion:
-    """Velocities by the pose, and the forward acceleration dvx/dt - vy r, on a grid of 20 ms or the row period."""
+    """Velocities by the pose, and the forward acceleration dvx/dt - vy r, on a grid of 20 ms or the row period.
+
+    Args:
+        t_s: stamps (N,).
+        motion: motion of the pose at the stamps.
+        segment: number of the unbroken stretch (N,).
+    """
     period = float(np.median(np.diff(t_s)))
     step = max(period, GRID_S)
     grid = np.arange(t_s[0], t_s[-1], step)

@@ -20,7 +20,7 @@ class Fault:
         observation: one clause without full stop.
         evidence: numbers by name, in SI units.
         option: ``carlab import`` option that corrects it; None where there is none.
-        rows: indices (from 0) of the rows that it touches; empty if it touches all.
+        rows: indices (n,) from 0 of the rows that it touches; empty if it touches all.
     """
 
     id: str

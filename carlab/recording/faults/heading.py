@@ -26,8 +26,8 @@ def heading_faults(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Fa
     """Compare yaw with the course over ground: unit, sense of rotation, constant offset.
 
     A car moves along its heading, forward or backward, up to its slip. So course - yaw, doubled to make forward and
-    backward alike, is concentrated when yaw is read correctly, and spread over the circle otherwise. ``values`` holds
-    x, y and yaw (N,) as declared.
+    backward alike, is concentrated when yaw is read correctly, and spread over the circle otherwise. ``values`` has x,
+    y [m] and yaw [rad] as declared, each (N,).
     """
     reach = max(1, round(0.05 / float(np.median(np.diff(t_s)))))
     span = t_s[2 * reach :] - t_s[: -2 * reach]

@@ -11,7 +11,10 @@ from carlab.recording.pose_velocity import BoolArray
 
 
 def stale_rows(t_s: FloatArray, pose: FloatArray) -> BoolArray:
-    """Rows (N,) that repeat the pose (N, 3) before to the last digit, where the pose then is somewhere else."""
+    """Rows (N,) that repeat the pose before to the last digit although the car moves, by the distance to the next pose.
+
+    ``pose`` (N, 3) is x, y [m], yaw [rad].
+    """
     same = np.concatenate([[False], (np.diff(pose, axis=0) == 0.0).all(axis=1)])
     stale = np.zeros(len(same), dtype=bool)
     for first, last in runs(same):
@@ -83,6 +86,12 @@ def frozen_rows(t_s: FloatArray, state: FloatArray, sensor: FloatArray, threshol
     """Rows (N,) in which the pose stands still for half a second while a sensor of that motion exceeds a threshold.
 
     Half a second is longer than the lag of such a sensor (0.1 to 0.2 s) when the car stops.
+
+    Args:
+        t_s: stamps (N,).
+        state: velocity of the pose (N,) that the sensor measures, in m/s or rad/s.
+        sensor: values of the sensor (N,).
+        threshold: in the unit of the sensor.
     """
     frozen = np.zeros(len(t_s), dtype=bool)
     for first, last in runs((np.abs(state) < 0.02) & (np.abs(sensor) > threshold)):

@@ -21,7 +21,7 @@ KEPT_SHARE = 0.95
 
 
 def robust_std(values: FloatArray) -> float:
-    """Standard deviation by the median of absolute deviations; 0 for an empty array."""
+    """Standard deviation of values (n,) by the median of absolute deviations; 0 for an empty array."""
     return STD_OVER_MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 
 
@@ -33,7 +33,7 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
-    """Starts and ends (exclusive) of the runs of True."""
+    """Starts and ends (exclusive) of the runs of True in a mask (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -45,7 +45,14 @@ def held_at(t_s: FloatArray, command: FloatArray, lag_s: float) -> FloatArray:
 
 
 def held_means(t_s: FloatArray, held: FloatArray, begin_s: FloatArray, width_s: FloatArray | float) -> FloatArray:
-    """Mean over [begin, begin + width) of a value (N,) that is held from each of ``t_s`` (N,) on."""
+    """Means (n,) over [begin, begin + width) of a value (N,) that is held from each of ``t_s`` (N,) on.
+
+    Args:
+        t_s: stamps (N,).
+        held: values (N,).
+        begin_s: begins of the intervals (n,).
+        width_s: their widths, one number or (n,).
+    """
     integral = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(t_s))])
 
     def integral_to(moments: FloatArray) -> FloatArray:
@@ -57,7 +64,7 @@ def held_means(t_s: FloatArray, held: FloatArray, begin_s: FloatArray, width_s: 
 
 
 def first_order_lag(values: FloatArray, period_s: float, time_constant_s: float) -> FloatArray:
-    """Filter an even grid (N,) by a first-order lag without dead time (trapezoidal rule)."""
+    """Filter values (N,) on an even grid by a first-order lag without dead time (trapezoidal rule)."""
     if time_constant_s <= 0.0:
         return values
     ratio = 2.0 * time_constant_s / period_s
@@ -83,10 +90,10 @@ class ColumnFit:
     Attributes:
         scale: in the column's unit over the reference's.
         lag_s: dead time [s].
-        unexplained: mean square of the residual over that of the column, without the 5 % of rows that fit worst.
+        unexplained: mean square of the residual over that of the column, without the 5 % of rows that fit worst [1].
         unexplained_unshifted: the same without filter and dead time.
-        rms: root mean square of the column.
-        prediction: scale * filtered reference(t - lag), (N,).
+        rms: root mean square of the column, in its unit.
+        prediction: scale * filtered reference(t - lag), (N,) in the column's unit.
     """
 
     scale: float
@@ -115,9 +122,9 @@ def fit_column(
 
     Args:
         t_s: stamps (N,).
-        reference: what the column should measure.
-        column: the column.
-        rows: rows to compare; larger values than six times the 90th percentile do not count.
+        reference: what the column should measure (N,).
+        column: the column (N,).
+        rows: mask (N,) of the rows to compare; larger values than six times the 90th percentile do not count.
         lags_s: even grid of dead times, refined by a parabola; without it, -1 to 2 rows in half rows, not refined,
             because velocity columns are differences of poses and lag by whole or half rows.
         time_constants_s: of the first-order filter; ``(0.0,)`` fits a dead time alone.

@@ -11,13 +11,13 @@ from carlab.recording.pose_velocity import IndexArray
 
 
 def gap_rows(t_s: FloatArray) -> IndexArray:
-    """Indices k, shape (G,), where there is a gap between rows k - 1 and k."""
+    """Indices k, shape (G,), where there is a gap between rows k - 1 and k of the stamps (N,)."""
     step = np.diff(t_s)
     return np.flatnonzero(step > max(LIMITS.gap_periods * float(np.median(step)), LIMITS.gap_s)) + 1
 
 
 def segments(rows: int, breaks: IndexArray) -> FloatArray:
-    """Number of the unbroken stretch that each row belongs to, shape (rows,)."""
+    """Number of the unbroken stretch of each row, (rows,); ``breaks`` (G,) are the first rows of new stretches."""
     starts = np.zeros(rows)
     starts[breaks] = 1
     return np.cumsum(starts)

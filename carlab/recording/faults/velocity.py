@@ -24,7 +24,7 @@ Frame = Literal["body", "world"]
 
 
 def velocity_references(motion: PoseMotion, frame: Frame = "body") -> dict[str, FloatArray]:
-    """Velocities of the pose (N,) that the columns vx, vy and yaw_rate should hold."""
+    """Velocities of the pose (N,) that the columns vx, vy [m/s] and yaw_rate [rad/s] should hold."""
     vx, vy = (motion.vx, motion.vy) if frame == "body" else (motion.vx_world, motion.vy_world)
     return {"vx": vx, "vy": vy, "yaw_rate": motion.yaw_rate}
 
@@ -73,7 +73,7 @@ def scale_faults(channel: str, fit: ColumnFit, reference: FloatArray) -> list[Fa
     Args:
         channel: ``vx``, ``vy`` or ``yaw_rate``; ``vx, vy`` for the speed of both.
         fit: the column fitted by the reference.
-        reference: the pose's velocity on the compared rows (n,).
+        reference: the pose's velocity on the compared rows (n,), in SI units.
 
     Returns:
         Faults with ``factor`` in their evidence, by which to multiply the column; without it, the column does not
@@ -108,7 +108,10 @@ def scale_faults(channel: str, fit: ColumnFit, reference: FloatArray) -> list[Fa
 
 @dataclass(frozen=True, slots=True)
 class Spikes:
-    """Spikes of a column: rows with a spike, with a spike or its tail, and other rows far off; each (N,)."""
+    """Spikes of a column: rows with a spike, with a spike or its tail, and other rows far off; each (N,).
+
+    ``error_sigmas`` (N,) is the absolute error of the fit over its robust standard deviation.
+    """
 
     peaks: BoolArray
     rows: BoolArray
@@ -121,7 +124,7 @@ class Spikes:
 
 
 def velocity_spikes(channel: str, period_s: float, column: FloatArray, prediction: FloatArray) -> Spikes:
-    """Rows of a velocity column (N,) far from its fit to the pose's velocity."""
+    """Rows of a velocity column (N,) [m/s or rad/s] far from ``prediction`` (N,), its fit to the pose's velocity."""
     index = VELOCITY_CHANNELS.index(channel)
     error = np.abs(column - prediction)
     sigma = robust_std(column - prediction)
@@ -132,7 +135,7 @@ def velocity_spikes(channel: str, period_s: float, column: FloatArray, predictio
 
 
 def spike_fault(channel: str, column: FloatArray, spikes: Spikes, motion: PoseMotion) -> Fault | None:
-    """Spikes at one yaw come from the difference of a wrapped angle; spikes at no particular yaw are outliers."""
+    """Spikes of a column (N,): at one yaw, they are differences of a wrapped angle; at no particular yaw, outliers."""
     peaks = spikes.peaks
     if not peaks.any():
         return None

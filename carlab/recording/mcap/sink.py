@@ -91,7 +91,7 @@ class McapSink(Sink):
                 partial_path(self.path).unlink()
 
     def write_extra(self, step: int, t_s: float, values: Mapping[str, float]) -> None:
-        """Write further columns of an imported recording at one step."""
+        """Write further columns of an imported recording at one step. Raises DataError before ``open``."""
         message = schemas.CLASSES["Extra"](t_s=t_s, step=step, names=list(values), values=list(values.values()))
         self._put(Stamped(schemas.EXTRA_TOPIC, message, t_s, t_s, step))
 

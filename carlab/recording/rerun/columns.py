@@ -49,7 +49,7 @@ class Columns:
         self._previous: FloatArray | None = None
 
     def indexes(self, times_s: Sequence[float] | FloatArray, steps: Sequence[int]) -> list[rr.TimeColumn]:
-        """All timelines of some rows."""
+        """All timelines of n rows with times and ticks (n,)."""
         times = [
             rr.TimeColumn(look.CAR_TIME, duration=np.asarray(times_s, dtype=np.float64) - self.origin_s),
             rr.TimeColumn(look.STEP, sequence=np.asarray(steps, dtype=np.int64)),
@@ -103,7 +103,14 @@ class Columns:
             self.scalars("episode/transition/reward", indexes, [row.reward for row in transitions])
 
     def overlay(self, name: str, times_s: Sequence[float], steps: Sequence[int], states: FloatArray) -> None:
-        """Send the states of an additional car; rows with NaN are omitted."""
+        """Send the states of an additional car; rows with NaN are omitted.
+
+        Args:
+            name: name of the car.
+            times_s: times on the car's clock (n,).
+            steps: ticks (n,).
+            states: (m, 6) x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]; the first min(n, m) rows are sent.
+        """
         count = min(len(times_s), len(states))
         whole = np.isfinite(states[:count]).all(axis=1)
         states = states[:count][whole]
@@ -146,7 +153,7 @@ class Columns:
 
 
 def yaw_quaternion(yaw_rad: FloatArray | float) -> FloatArray:
-    """Quaternions (..., 4) in the order x, y, z, w of rotations about z by angles (...,)."""
+    """Quaternions (..., 4) in the order x, y, z, w of rotations about z by angles (...,) [rad]."""
     half_rad = 0.5 * np.asarray(yaw_rad)
     zero = np.zeros_like(half_rad)
     return np.stack([zero, zero, np.sin(half_rad), np.cos(half_rad)], axis=-1)

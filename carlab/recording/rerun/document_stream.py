@@ -93,7 +93,7 @@ class DocumentStream:
                 self.text(look.END, f"{item.reason.name}: {item.reason.value} {item.detail}".rstrip(), level)
 
     def overlay(self, name: str, states: FloatArray) -> None:
-        """Write the states of an additional car at the times of all rows so far; rows with NaN are omitted."""
+        """Write states (n, 6) of an additional car at the times of all rows so far; rows with NaN are omitted."""
         self.columns.overlay(name, [t_s for _, t_s in self.rows], [step for step, _ in self.rows], states)
 
     def flush(self) -> None:

@@ -102,7 +102,7 @@ class RunRecording:
         Args:
             t_s: time of the prediction on the car's clock [s].
             step: its tick.
-            mean: predicted states (K + 1, 6).
+            mean: predicted states (K + 1, 6) in SI units.
             across_std: standard deviation of the position across the path (K + 1,) [m].
         """
         self.documents.columns.set_time(t_s - self.documents.columns.origin_s, step)

@@ -72,7 +72,7 @@ class RerunSink(Sink):
         self._opened = True
 
     def flush(self) -> None:
-        """Send the collected rows and wait until rerun has passed them to the operating system."""
+        """Send the collected rows and wait until rerun has passed them to the system. Raises OSError if that fails."""
         if self._documents is not None:
             self._documents.flush()
             self._flush_stream(self._documents.stream)
