@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from carlab.api.cars import load_car
 from carlab.api.loaded_recordings import RecordingLike, as_list, recordings_of_runs
 from carlab.api.loaded_recordings import load_recordings as read
+from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -46,7 +47,6 @@ def compare(
         ConfigError: a group is empty, a recording is in both groups, or a candidate does not exist.
         DataError: a recording cannot be read, or a group is too short or too uniform; the message has the remedy.
     """
-    from carlab.core.errors import ConfigError
     from carlab.core.tables import nearest_name
     from carlab.diagnosis.comparison.candidates import change_candidates
     from carlab.diagnosis.comparison.compare import compare as search
@@ -78,7 +78,10 @@ def compare(
 
 def _save(found: Comparison, folder: Path) -> None:
     from carlab.recording.atomic_files import write_text
-    from carlab.recording.sink import make_folder
+    from carlab.recording.sink import describe_os_error, make_folder
 
-    make_folder(folder)
+    try:
+        make_folder(folder)
+    except OSError as error:
+        raise DataError(describe_os_error(error, folder)) from error
     write_text(folder / FILE_NAME, json.dumps(found.to_dict(), indent=2) + "\n")

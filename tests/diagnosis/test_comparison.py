@@ -77,6 +77,12 @@ def test_stop_without_a_change_is_inconclusive(first):
     assert stopped.sentence == "The comparison was stopped before all candidates were tested."
 
 
+def test_result_that_cannot_be_written_is_refused_with_one_sentence(first, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file"):
+        carlab.compare([first], [first], "sim", out=tmp_path / "file" / "out", stop=lambda: True)
+
+
 def test_unusable_groups_are_refused_with_one_sentence(first):
     with pytest.raises(DataError, match=r"second group has 20 s of driving; a comparison needs 50 s"):
         compare([first], [drive(CAR, 20.0, 3)], CAR)
