@@ -224,13 +224,11 @@ def fit_fsvgd(
         normaliser: of inputs and outputs.
         settings: of the fit.
         progress: called with the number of steps done, every ``PROGRESS_PERIOD_STEPS``.
-        held_out: raw inputs (v, D) and outputs (v, O) of validation rows; the particles with the lowest loss on them
-            are kept.
+        held_out: raw inputs (v, D) and outputs (v, O); the particles with the lowest loss on these rows are kept.
         row_mask: whether each particle is fitted to each row (L, n), for particles that do not interact; None: to all.
 
     Raises:
-        DataError: neither data nor prior is given, rows of inputs and outputs differ in number, or numbers are missing
-            or infinite.
+        DataError: neither data nor prior, inputs and outputs of different length, or missing or infinite numbers.
         DivergedError: the particles diverged.
     """
     count = len(inputs)
