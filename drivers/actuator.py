@@ -75,7 +75,7 @@ class Actuator:
             raise
 
     def arm(self) -> None:
-        """Enable commands. Raises NotReadyError, or ActuatorFaultError while a fault is latched."""
+        """Enable commands. Raises NotReadyError, NotOpenError, or ActuatorFaultError while a fault is latched."""
         self.require_no_fault()
         self._await(lambda s: s.state != SenderState.STOPPING, ANSWER_TIMEOUT_S)
         with self._lock:
@@ -93,7 +93,10 @@ class Actuator:
                 self._armed_epoch = epoch
 
     def await_telemetry(self, timeout_s: float) -> None:
-        """Wait until the telemetry is fresh, ``timeout_s`` at most; a busy host delays it by tenths of a second."""
+        """Wait until the telemetry is fresh, ``timeout_s`` at most; a busy host delays it by tenths of a second.
+
+        Raises NotOpenError.
+        """
         self._await(lambda s: time.monotonic() - s.t_telemetry_s <= self.config.telemetry_stale_s, timeout_s)
 
     def command(self, action: Action) -> Action:
@@ -141,7 +144,10 @@ class Actuator:
         self._await(is_over, ANSWER_TIMEOUT_S)
 
     def reset_fault(self) -> None:
-        """Clear a latched fault; the actuator stays disarmed. Raises ActuatorFaultError if the cause persists."""
+        """Clear a latched fault; the actuator stays disarmed.
+
+        Raises ActuatorFaultError if the cause persists, and NotOpenError.
+        """
         status = self._require_live_status(self._opened())
         if not self._latched and status.state != SenderState.FAULT:
             return
@@ -157,7 +163,7 @@ class Actuator:
         return self._opened().status()
 
     def require_no_fault(self) -> None:
-        """Raise ActuatorFaultError if a fault is latched or the sender has ended."""
+        """Raise ActuatorFaultError if a fault is latched or the sender has ended or hangs, NotOpenError when closed."""
         self._require_faultless_status(self._opened())
 
     def problems(self) -> tuple[str, ...]:

@@ -33,18 +33,24 @@ class DryRunCar(Car):
         self._is_open = True
 
     def observe(self) -> Observation:
-        """Observation of the wrapped car."""
+        """Observation of the wrapped car, with its errors."""
         return self.car.observe()
 
     def arm(self) -> None:
-        """Arm the dry run; the wrapped car stays disarmed."""
+        """Arm the dry run; the wrapped car stays disarmed.
+
+        Raises ActuatorFaultError while a fault is latched, NotOpenError when closed.
+        """
         self._require_open()
         if self._is_latched:
             raise ActuatorFaultError("The dry run was stopped for safety; reset the fault first.")
         self._is_armed = True
 
     def command(self, action: Action) -> Action:
-        """Check the action and return the action that would have been sent."""
+        """Check the action and return the action that would have been sent.
+
+        Raises NotOpenError, ActionOutOfRangeError and NotArmedError.
+        """
         self._require_open()
         self.check(action)
         if not self._is_armed:
@@ -60,7 +66,7 @@ class DryRunCar(Car):
         self.car.stop(planned=planned)
 
     def reset_fault(self) -> None:
-        """Clear the latched fault here and in the wrapped car."""
+        """Clear the latched fault here and in the wrapped car. Raises NotOpenError when closed."""
         self._require_open()
         self.car.reset_fault()
         self._is_latched = False

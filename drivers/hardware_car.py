@@ -87,7 +87,10 @@ class HardwareCar(Car):
         self._is_open = True
 
     def observe(self) -> Observation:
-        """Newest state and the raw poses since the last call; ``tracked`` belongs to the newest sample."""
+        """Newest state and the raw poses since the last call; ``tracked`` belongs to the newest sample.
+
+        Raises PoseLostError before the first pose, NotOpenError when closed.
+        """
         self._require_open()
         self._take_poses()
         estimate = self.estimator.estimate()
@@ -114,7 +117,8 @@ class HardwareCar(Car):
     def arm(self) -> None:
         """Arm the actuator if actuator and motion capture are ready and the car is at rest.
 
-        Waits half a second at most for late telemetry, and as long for late poses (a busy host).
+        Waits half a second at most for late telemetry, and as long for late poses (a busy host). Raises NotReadyError
+        with all reasons, ActuatorFaultError while a fault is latched, NotOpenError when closed.
         """
         self._require_open()
         self.actuator.require_no_fault()
@@ -136,7 +140,10 @@ class HardwareCar(Car):
         self.actuator.arm()
 
     def command(self, action: Action) -> Action:
-        """Check and post a command; returns the command on the wire."""
+        """Check and post a command; returns the command on the wire.
+
+        Raises ActionOutOfRangeError (nothing is sent), NotArmedError, ActuatorFaultError and NotOpenError.
+        """
         self._require_open()
         self.check(action)
         return self.actuator.command(action)
@@ -146,7 +153,7 @@ class HardwareCar(Car):
         self.actuator.stop(planned=planned)
 
     def reset_fault(self) -> None:
-        """Clear a latched fault. Raises ActuatorFaultError if the cause persists."""
+        """Clear a latched fault. Raises ActuatorFaultError if the cause persists, NotOpenError when closed."""
         self._require_open()
         self.actuator.reset_fault()
 

@@ -21,7 +21,7 @@ from drivers.sender.status import SenderStatus
 
 @contextmanager
 def firmware_process() -> Iterator[str]:
-    """Run an emulated VESC in a separate process; yields its port."""
+    """Run an emulated VESC in a separate process; yields its port. Raises NotReadyError if it does not start."""
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder) / "vesc"
         process = subprocess.Popen(

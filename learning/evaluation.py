@@ -23,8 +23,8 @@ class Mixture:
 
     Attributes:
         means: (L, N, O).
-        stds: scales, broadcast against the means: standard deviations if ``dof`` is infinite; of decorrelated errors
-            if ``decorrelation`` is given.
+        stds: scales that broadcast to (L, N, O): standard deviations if ``dof`` is infinite; of decorrelated errors if
+            ``decorrelation`` is given.
         dof: degrees of freedom of the components' multivariate Student-t distributions, in which one random scale
             multiplies all outputs (Lange, Little and Taylor 1989, section 2); infinite for Gaussians.
         decorrelation: matrix (O, O) that multiplies a component's errors from the left; None is the identity.
@@ -58,7 +58,7 @@ class Mixture:
 
     @property
     def marginal_scales(self) -> Tensor:
-        """Scale of each output's marginal distribution; broadcasts against the means."""
+        """Scale of each output's marginal distribution, in the shape of ``stds``; broadcasts to (L, N, O)."""
         if self.decorrelation is None:
             return self.stds
         inverse: Tensor = torch.linalg.inv_ex(self.decorrelation).inverse
@@ -91,7 +91,7 @@ class Mixture:
         return replace(self, means=self.mean + shrink * deviation, stds=(self.stds**2 + spread**2).sqrt())
 
     def gaussians(self, each: int = 20) -> Mixture:
-        """Approximation by Gaussians, ``each`` for a Student-t component; it has lighter far tails."""
+        """Approximation by ``each * L`` Gaussians, ``each`` for a Student-t component; it has lighter far tails."""
         if math.isinf(self.dof):
             return self
         scales = tail_scales(self.dof, each).to(self.stds)[:, None, None, None]

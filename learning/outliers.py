@@ -186,7 +186,10 @@ def median_scale(square: Tensor, dof: float) -> Tensor:
 
 @cache
 def tail_scales(dof: float, count: int) -> Tensor:
-    """Scales (count,) of Gaussians whose equally weighted mixture approximates a Student-t distribution."""
+    """Scales (count,) of Gaussians whose equally weighted mixture approximates a Student-t distribution.
+
+    Quantiles of its scale mixture (Lange, Little and Taylor 1989, section 2).
+    """
     if math.isinf(dof):
         return torch.ones(count)
     quantiles = (torch.arange(count, dtype=torch.float64) + 0.5) / count
@@ -194,7 +197,7 @@ def tail_scales(dof: float, count: int) -> Tensor:
 
 
 def log_student(square: Tensor, outputs: int, dof: float) -> Tensor:
-    """Log density of a multivariate Student-t distribution of unit scale.
+    """Log density (...) of a multivariate Student-t distribution of unit scale.
 
     Args:
         square: squared Mahalanobis distances (...).

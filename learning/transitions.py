@@ -55,7 +55,7 @@ class Transitions:
         return len(self.inputs)
 
     def take(self, rows: np.ndarray) -> Transitions:
-        """Some of the rows, by index or mask."""
+        """Some of the rows, by index (m,) or mask (n,)."""
         return Transitions(self.inputs[rows], self.targets[rows], self.episode[rows], self.tick[rows], self.history)
 
 

@@ -13,7 +13,7 @@ from mocap.natnet.models import NEWEST_BITSTREAM, OLDEST_BITSTREAM, BitstreamVer
 
 @dataclass(frozen=True, slots=True)
 class MocapConfig:
-    """Address of a NatNet server (Motive), and the rigid body of the car."""
+    """Address of a NatNet server (Motive), and the rigid body of the car. Raises ConfigError for invalid values."""
 
     server_address: str = "127.0.0.1"
     """Address of the computer that runs Motive."""

@@ -12,11 +12,14 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 Value: TypeAlias = Any
-"""A float, a NumPy array or a torch tensor, shape () or (cars,)."""
+"""A float, a NumPy array or a torch tensor, shape () or (cars,); while equations are traced, a node of their graph."""
 
 
 class Ops(Protocol):
-    """Elementary functions of one array library."""
+    """Elementary functions of one array library, element by element: arguments broadcast to the shape of the result.
+
+    Angles are in rad.
+    """
 
     def sin(self, x: Value, /) -> Value: ...  # noqa: D102
     def cos(self, x: Value, /) -> Value: ...  # noqa: D102
@@ -45,7 +48,7 @@ class Ops(Protocol):
 
 
 class FloatOps:
-    """Python floats and ``math``: one car."""
+    """Python floats and ``math``: one car. All shapes are ()."""
 
     sin = staticmethod(math.sin)
     cos = staticmethod(math.cos)

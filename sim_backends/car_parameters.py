@@ -124,7 +124,11 @@ class SimulatorConfig:
         return self if table == "timing" else self.mocap if table == "mocap" else self.parameters
 
     def with_values(self, changes: Mapping[str, float]) -> Self:
-        """Copy with changed numbers by dotted name; an effect with a number is added."""
+        """Copy with changed numbers by dotted name; an effect with a number is added.
+
+        Raises:
+            ConfigError: an unknown name, or an impossible value.
+        """
         check_keys(changes, REGISTRY, "the parameters")
         grouped: dict[str, dict[str, Any]] = {"parameters": {}, "mocap": {}, "timing": {}}
         effects = {effect_id: dict(given) for effect_id, given in self.effects.items()}
@@ -227,7 +231,7 @@ class SimulatorConfig:
 
     @classmethod
     def from_preset(cls, name: str = "rc_car") -> Self:
-        """Create a preset of the package, see ``preset_names``."""
+        """Create a preset of the package, see ``preset_names``. Raises ConfigError for another name."""
         if name not in preset_names():
             raise ConfigError(f"There is no preset '{name}'; choose one of {', '.join(preset_names())}.")
         text = (resources.files("sim_backends") / "presets" / f"{name}.toml").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ from sim_backends.effects.base import Parameters
 from sim_backends.effects.first_order import LagWeights, lag_weights
 
 State: TypeAlias = tuple[Value, ...]
-"""x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]."""
+"""x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s], or the velocities alone; of shapes that broadcast."""
 LATENCY = "mocap.latency"
 COMMAND_DELAY = "timing.command_delay"
 
@@ -141,7 +141,7 @@ class MeasurementModel:
 def filter_step(ops: Ops, output: State, first: State, last: State, step_s: Value, lag_s: Value) -> State:
     """First-order filter over one step, exact for an input that goes from ``first`` to ``last`` in a straight line.
 
-    ``lag_s dy/dt = u - y``; with a time constant of 0 the output is the input.
+    ``lag_s dy/dt = u - y``, with ``lag_s`` and ``step_s`` [s]; with a time constant of 0 the output is the input.
     """
     return _filtered(lag_weights(ops, lag_s, 2.0 * step_s), output, first, last)
 
@@ -153,7 +153,10 @@ def _filtered(weights: LagWeights, output: State, first: State, last: State) -> 
 def filter_velocities(
     ops: Ops, inputs: Sequence[State], period_s: Value, lag_s: Value, begin: State | None = None
 ) -> list[State]:
-    """Outputs of the first-order filter at even ticks; it starts at ``begin``, by default at the first input."""
+    """Outputs of ``filter_step`` at ticks with a period [s], one for each of the inputs.
+
+    It starts at ``begin``, by default at the first input.
+    """
     outputs = [inputs[0] if begin is None else begin]
     weights = lag_weights(ops, lag_s, 2.0 * period_s)
     for first, last in itertools.pairwise(inputs):
@@ -162,7 +165,7 @@ def filter_velocities(
 
 
 def windowed(ops: Ops, state: State, around: tuple[State, State, State], period_s: Value, variance_s2: float) -> State:
-    """A state, its velocities averaged over a symmetric window with a variance [s2].
+    """A state, its velocities averaged over a symmetric window with a variance [s2]; ticks have a period [s].
 
     The average is ``v + variance / 2 d2v/dt2``, to fourth order. ``around`` are three states at even ticks, the middle
     one ``state`` itself, or its neighbour at an end of a trajectory, where the average is to third order.
@@ -190,7 +193,9 @@ def velocity_curvature(ops: Ops, before: State, now: State, after: State, period
 
 
 def delay_as_recorded_s(ops: Ops, values: Mapping[str, Value], effects: Iterable[str], latency_s: Value) -> Value:
-    """The ``timing.command_delay`` [s] relative to a recording: measured states are old, so commands act later by that.
+    """The ``timing.command_delay`` [s] relative to a recording, () or (cars,).
+
+    Measured states are old by the latency [s], so commands act later by it.
 
     It is raised if its sum with the delay effects would be negative.
     """

@@ -116,7 +116,7 @@ def register(effect: Effect) -> None:
 
 @contextlib.contextmanager
 def registered(*effects: Effect) -> Iterator[None]:
-    """Register effects for the time of a ``with`` block."""
+    """Register effects for the time of a ``with`` block. Raises ConfigError as ``register``."""
     known: list[Effect] = []
     try:
         for effect in effects:

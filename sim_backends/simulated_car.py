@@ -98,7 +98,7 @@ class SimulatedCar(Car):
         """Put the car at ``state`` with neutral acting and no command pending; takes about 0.1 s of the clock.
 
         The car is at ``state`` when this returns. The preceding samples are those of a motion with the velocities of
-        ``state``, so that the estimated velocities are correct at once.
+        ``state``, so that the estimated velocities are correct at once. Raises NotOpenError when closed.
         """
         self._require_open()
         begin_s = self.clock.now_s()
@@ -115,13 +115,13 @@ class SimulatedCar(Car):
 
     @property
     def true_state(self) -> CarState:
-        """True state at the clock's time (simulation only)."""
+        """True state at the clock's time (simulation only). Raises NotOpenError when closed."""
         self._require_open()
         self._run_to(self.clock.now_s())
         return self._plant.state
 
     def observe(self) -> Observation:
-        """Newest state that has arrived."""
+        """Newest state that has arrived. Raises PoseLostError before the first pose, NotOpenError when closed."""
         self._require_open()
         self._run_to(self.clock.now_s())
         estimate, newest = self._estimator.estimate(), self._estimator.newest
@@ -141,13 +141,13 @@ class SimulatedCar(Car):
         )
 
     def arm(self) -> None:
-        """Enable commands."""
+        """Enable commands. Raises ActuatorFaultError while a fault is latched, NotOpenError when closed."""
         self._require_open()
         self._require_no_fault()
         self._armed = True
 
     def command(self, action: Action) -> Action:
-        """Issue a command."""
+        """Issue a command. Raises ActionOutOfRangeError, NotArmedError, ActuatorFaultError or NotOpenError."""
         self._require_open()
         self._require_no_fault()
         self.check(action)

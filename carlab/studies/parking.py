@@ -97,6 +97,7 @@ def check_run(folder: Path, options: Mapping[str, tuple[str, int | str | None]])
 
     Raises:
         ConfigError: an option differs.
+        DataError: the folder is not a run of carlab learn.
     """
     plan = _plan(folder)
     plan["method"] = method_of(plan)

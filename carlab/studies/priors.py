@@ -41,15 +41,15 @@ class InDomain:
         return self.model.size
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Inputs of the domain."""
+        """Inputs of the domain (N, D)."""
         return self.domain.inputs(count, generator)
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """Parameters of the simulator."""
+        """Parameters of the simulator (P, K) for standard normal draws (P, K)."""
         return self.model.parameters(normal)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Outputs of the simulator."""
+        """Outputs of the simulator (P, N, O) at inputs (N, D) for parameters (P, K)."""
         return self.model(inputs, parameters)
 
 

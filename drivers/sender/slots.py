@@ -52,7 +52,7 @@ class Slot:
         return cls(descriptor, capacity)
 
     def write(self, value: bytes) -> None:
-        """Publish ``value`` atomically for readers."""
+        """Publish ``value`` atomically for readers. Raises ValueError if it is too long or the slot is closed."""
         memory = self._memory
         if memory is None:
             raise ValueError("The slot is closed.")
@@ -66,7 +66,10 @@ class Slot:
         self._sequence = sequence
 
     def read(self) -> tuple[int, bytes] | None:
-        """Sequence number and value of the newest valid copy; None if no copy is valid."""
+        """Sequence number and value of the newest valid copy; None if no copy is valid.
+
+        Raises ValueError if the slot is closed.
+        """
         for _ in range(READ_ATTEMPTS):
             copies = [copy for half in (0, 1) if (copy := self._read_half(half)) is not None]
             if copies:

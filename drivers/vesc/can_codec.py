@@ -1,5 +1,7 @@
 """VESC over CAN: encode commands to frames, decode frames to telemetry and payloads. Pure functions.
 
+Functions that return a frame raise ProtocolError for a number that does not fit, is not finite, or is no controller id.
+
 Facts (vedderb/bldc comm/comm_can.c, documentation/comm_can.md): 29-bit identifiers, ``(packet << 8) | controller``;
 messages of fixed layout are in ``dbc/vesc.dbc``; every other command goes through a small transport: up to 6 bytes in
 one PROCESS_SHORT_BUFFER, more in FILL_RX_BUFFER pieces and a PROCESS_RX_BUFFER with length and CRC-16/XMODEM.
@@ -122,7 +124,10 @@ def pong(host_id: int, controller_id: int, hardware_type: int = 0) -> CanFrame:
 
 
 def encode_payload(receiver_id: int, sender_id: int, payload: bytes, send: ReplyMode) -> list[CanFrame]:
-    """Transport a payload of 1 to 512 bytes from ``sender_id`` to ``receiver_id``."""
+    """Transport a payload of 1 to 512 bytes from ``sender_id`` to ``receiver_id``.
+
+    Raises ProtocolError for another length or id.
+    """
     if not 1 <= len(payload) <= MAX_PAYLOAD:
         raise ProtocolError(f"A payload has 1 to {MAX_PAYLOAD} bytes, not {len(payload)}.")
     if len(payload) <= 6:
@@ -215,7 +220,10 @@ def decode_status(frame: CanFrame) -> MotorValues | None:
 
 
 def decode_status_signals(frame: CanFrame) -> dict[str, float] | None:
-    """Decode all signals of a STATUS_1 ... 6 broadcast by their names in the DBC; None for other frames."""
+    """Decode all signals of a STATUS_1 ... 6 broadcast by their names in the DBC; None for other frames.
+
+    Raises ProtocolError for a status of the wrong length.
+    """
     if packet_of(frame) not in STATUS_PACKETS:
         return None
     message = database().get_message_by_frame_id(frame.identifier)

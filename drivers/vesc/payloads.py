@@ -74,24 +74,27 @@ def _set_int32(command: Command, value: float, scale: float, name: str) -> bytes
 
 
 def set_duty(duty: float) -> bytes:
-    """SET_DUTY; ``duty`` in [-1, 1], 1e-5 resolution."""
+    """SET_DUTY; ``duty`` in [-1, 1], 1e-5 resolution. Raises ProtocolError for another number."""
     if not -1.0 <= duty <= 1.0:
         raise ProtocolError(f"duty {duty} is outside [-1, 1].")
     return _set_int32(Command.SET_DUTY, duty, DUTY_SCALE, "duty")
 
 
 def set_current(current_a: float) -> bytes:
-    """SET_CURRENT [A], 1 mA resolution."""
+    """SET_CURRENT [A], 1 mA resolution. Raises ProtocolError for a number that does not fit or is not finite."""
     return _set_int32(Command.SET_CURRENT, current_a, CURRENT_SCALE, "current")
 
 
 def set_current_brake(current_a: float) -> bytes:
-    """SET_CURRENT_BRAKE [A], 1 mA resolution."""
+    """SET_CURRENT_BRAKE [A], 1 mA resolution. Raises ProtocolError as ``set_current``."""
     return _set_int32(Command.SET_CURRENT_BRAKE, current_a, CURRENT_SCALE, "brake current")
 
 
 def set_servo_position(position: float) -> bytes:
-    """SET_SERVO_POS in [0, 1], 0.001 resolution. The servo has no time-out and does not reset the motor's."""
+    """SET_SERVO_POS in [0, 1], 0.001 resolution. Raises ProtocolError for another number.
+
+    The servo has no time-out and does not reset the motor's.
+    """
     if not 0.0 <= position <= 1.0:
         raise ProtocolError(f"servo position {position} is outside [0, 1].")
     return struct.pack(">Bh", Command.SET_SERVO_POS, scaled_integer(position, SERVO_SCALE, 16, "servo position"))
@@ -180,7 +183,10 @@ OLD_LAYOUT_LENGTH = 56
 
 
 def encode_values(values: MotorValues, mask: int) -> bytes:
-    """Encode the telemetry fields of the ``mask`` bits as the firmware does; None becomes zero."""
+    """Encode the telemetry fields of the ``mask`` bits as the firmware does; None becomes zero.
+
+    Raises ProtocolError for a number that does not fit or is not finite.
+    """
     out = bytearray()
     for bit, (form, scale, names) in enumerate(VALUE_ROWS):
         if mask >> bit & 1:

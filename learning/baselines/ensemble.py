@@ -59,7 +59,7 @@ class Ensemble:
         return Mixture(components.mean[None], std[None], self.residuals.dof, decorrelation, correlation)
 
     def errors(self, inputs: Tensor, outputs: Tensor) -> Tensor:
-        """Decorrelated errors (L, n, O) of the networks at raw rows, double precision."""
+        """Decorrelated errors (L, n, O) of the networks at raw rows of (n, D) and (n, O), double precision."""
         return self._decorrelate(outputs - self.networks.predict(inputs).means).double()
 
     def _decorrelate(self, errors: Tensor) -> Tensor:

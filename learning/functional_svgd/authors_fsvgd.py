@@ -86,7 +86,7 @@ class WorldDynamics:
         object.__setattr__(self, "_sampler", PosteriorSampler.of(self.posterior))
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) a step later; sine and cosine are projected onto the unit circle."""
+        """Features (N, 7 + 2 H) one step after ``action`` (N, 2); sine and cosine are projected on the unit circle."""
         now = in_world(features)
         after = now + self._sampler(_inputs(now, features, action), generator)
         yaw = torch.atan2(after[:, 2:3], after[:, 3:4])
@@ -96,7 +96,11 @@ class WorldDynamics:
         return next_features
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
-        """Negative log-likelihood of an episode's steps, seven outputs [nat per step], and calibration error."""
+        """Negative log-likelihood of an episode's steps, seven outputs [nat per step], and calibration error.
+
+        Raises:
+            DataError: the episode has no complete step.
+        """
         inputs, changes = (v.to(self.posterior.parameters) for v in world_rows([episode], self.history))
         predicted = self.posterior.predict(inputs)
         return negative_log_likelihood(predicted, changes), calibration_error(predicted, changes)
@@ -145,7 +149,8 @@ def fit_authors_fsvgd(
         corrected: without the errors of the authors' code.
 
     Raises:
-        DataError: the episodes hold too few rows.
+        DataError: the episodes hold no complete step, or too few rows.
+        DivergedError: the particles diverged.
     """
     settings = authors_settings(steps, seed, with_simulator=simulator is not None, corrected=corrected)
     width = STATE_FEATURES + 2 * (history + 1)

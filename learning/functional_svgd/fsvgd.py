@@ -51,7 +51,7 @@ class GaussianProcessPrior:
     jitter: float = 1e-3
 
     def marginal(self, chosen: Tensor) -> Marginal:
-        """Gaussian at some of the inputs."""
+        """Gaussian at the inputs with indices ``chosen`` (N,)."""
         return gaussian_process(self.inputs[chosen], self.covariance, self.jitter)
 
 
@@ -74,7 +74,7 @@ class SimulatorPrior:
     jitter: float = JITTER
 
     def marginal(self, chosen: Tensor) -> Marginal:
-        """Gaussian with the moments of the draws at some of the inputs."""
+        """Gaussian with the moments of the draws at the inputs with indices ``chosen`` (N,)."""
         return simulator_marginal(self.draws[:, chosen], self.discrepancy_inputs[chosen], self.discrepancy, self.jitter)
 
 
@@ -145,7 +145,7 @@ class FsvgdSettings:
 
 
 def check_rows(inputs: Tensor, outputs: Tensor, *others: Tensor) -> None:
-    """Check rows of inputs (n, D) and outputs (n, O), and further inputs.
+    """Check rows of inputs (n, D) and outputs (n, O), and further inputs (M, D).
 
     Raises:
         DataError: rows of inputs and outputs differ in number, or numbers are missing or infinite.
@@ -224,11 +224,11 @@ def fit_fsvgd(
         normaliser: of inputs and outputs.
         settings: of the fit.
         progress: called with the number of steps done, every ``PROGRESS_PERIOD_STEPS``.
-        held_out: raw inputs and outputs of validation rows; the particles with the lowest loss on them are kept.
+        held_out: raw inputs (v, D) and outputs (v, O); the particles with the lowest loss on these rows are kept.
         row_mask: whether each particle is fitted to each row (L, n), for particles that do not interact; None: to all.
 
     Raises:
-        DataError: neither data nor prior is given, or numbers are missing or infinite.
+        DataError: neither data nor prior, inputs and outputs of different length, or missing or infinite numbers.
         DivergedError: the particles diverged.
     """
     count = len(inputs)

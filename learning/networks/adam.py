@@ -17,7 +17,14 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
 @dataclass
 class Adam:
-    """Adam's state for one tensor: parameters and moments of their gradient; ``second`` is beta_2."""
+    """Adam's state for one tensor.
+
+    Attributes:
+        parameters: of any shape; changed in place.
+        weight_decay: decoupled from the gradient; the learning rate multiplies it.
+        second: beta_2.
+        mean, square: moments of the gradient, in the shape of the parameters.
+    """
 
     parameters: Tensor
     weight_decay: float = 0.0
@@ -36,7 +43,7 @@ class Adam:
         return int(self._steps)
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Move the parameters against their gradient."""
+        """Move the parameters against their gradient, a tensor of the same shape, by the learning rate ``rate``."""
         self._steps += 1.0
         torch._fused_adamw_(
             [self.parameters], [gradient], [self.mean], [self.square], [], [self._steps],
@@ -45,7 +52,7 @@ class Adam:
         )  # fmt: skip
 
     def state(self) -> dict[str, Tensor | int]:
-        """A copy of the moments, on the CPU."""
+        """Number of steps, and a copy of both moments in the shape of the parameters, on the CPU."""
         return {"steps": self.steps, "mean": self.mean.cpu().clone(), "square": self.square.cpu().clone()}
 
     def load(self, state: dict[str, Tensor | int]) -> None:

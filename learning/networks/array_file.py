@@ -26,14 +26,14 @@ _UNREADABLE = (
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Tensor | int]) -> None:
-    """Write tensors of any device, and integers. Raises OSError if the disk is full."""
+    """Write tensors of any device and shape, and integers. Raises OSError if the disk is full."""
     content = io.BytesIO()
     np.savez(content, **{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in arrays.items()})  # type: ignore[arg-type]
     path.write_bytes(content.getvalue())
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Read all arrays of a file.
+    """Read all arrays of a file by name, of any shape.
 
     Raises:
         DataError: the file cannot be read, or holds more than ``MAX_BYTES`` or values other than numbers. The message
@@ -66,7 +66,7 @@ def checked_tensor(arrays: Mapping[str, NDArray[np.generic]], name: str, shape: 
 
 
 def whole_number(arrays: Mapping[str, NDArray[np.generic]], name: str) -> int:
-    """One integer. Raises DataError if it is missing, negative or not an integer."""
+    """One integer, from an array of shape (). Raises DataError if it is missing, negative or not an integer."""
     array = arrays.get(name)
     if array is None or array.shape != () or array.dtype.kind not in "iu" or int(array) < 0:
         raise DataError(f"{name} is not a non-negative integer")

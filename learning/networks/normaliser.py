@@ -25,20 +25,20 @@ class Normaliser:
     decorrelation: Tensor | None = None
 
     def inputs(self, raw: Tensor) -> Tensor:
-        """Normalised inputs."""
+        """Normalised inputs (..., D) of raw inputs (..., D)."""
         return (raw - self.input_mean) / self.input_std
 
     def outputs(self, raw: Tensor) -> Tensor:
-        """Normalised outputs."""
+        """Normalised outputs (..., O) of raw outputs (..., O)."""
         scaled = (raw - self.output_mean) / self.output_std
         return scaled if self.decorrelation is None else scaled @ self.decorrelation.to(scaled).T
 
     def raw_inputs(self, normalised: Tensor) -> Tensor:
-        """Inputs in physical units."""
+        """Inputs (..., D) in physical units, of normalised inputs (..., D)."""
         return normalised * self.input_std + self.input_mean
 
     def raw_outputs(self, normalised: Tensor) -> Tensor:
-        """Outputs in physical units."""
+        """Outputs (..., O) in physical units, of normalised outputs (..., O)."""
         if self.decorrelation is not None:
             normalised = normalised @ torch.linalg.inv_ex(self.decorrelation.double()).inverse.to(normalised).T
         return normalised * self.output_std + self.output_mean

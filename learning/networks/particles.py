@@ -58,7 +58,9 @@ class Network:
         return sum((fan_in + 1) * fan_out for fan_in, fan_out in self.layers)
 
     def initial(self, particles: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Tensor:
-        """Parameters (L, P): He-uniform hidden weights, small uniform biases, a head without bias.
+        """Parameters (L, P): He-uniform hidden weights, small uniform biases, a head whose biases are zero.
+
+        He, Zhang, Ren and Sun 2015 ("Delving Deep into Rectifiers", equation 10).
 
         Drawn on the generator's device and moved, so that a seed means the same numbers everywhere.
         """
@@ -98,7 +100,7 @@ class Network:
         return self.through(self.split(parameters), inputs)
 
     def through(self, layers: Layers, inputs: Tensor) -> tuple[Tensor, Pullback]:
-        """``values_and_pullback`` for layers from ``split``."""
+        """``values_and_pullback`` at inputs (N, D), or (L, N, D), for layers from ``split``."""
         layer_inputs, preactivations = [self._by_particle(inputs, len(layers[0][0]))], []
         *hidden, (weights, biases) = layers
         for w, b in hidden:
@@ -119,7 +121,7 @@ class Network:
         return functional.leaky_relu(preactivation, self.slope, inplace=inplace)
 
     def activation_pullback(self, direction: Tensor, preactivation: Tensor) -> Tensor:
-        """Gradient with respect to preactivations, from one with respect to activations; one pass over the memory."""
+        """Gradient with respect to preactivations, from one with respect to activations; all (L, N, H)."""
         gradient: Tensor
         if self.activation == "silu":
             gradient = torch.ops.aten.silu_backward(direction, preactivation)
@@ -145,7 +147,7 @@ class Pullback:
     preactivations: Sequence[Tensor]
 
     def __call__(self, direction: Tensor) -> Tensor:
-        """Gradient (L, P) of ``sum(direction * outputs)`` with respect to the parameters."""
+        """Gradient (L, P) of ``sum(direction * outputs)`` with respect to the parameters; direction (L, N, O)."""
         parts: list[Tensor] = []
         for k in range(len(self.layers) - 1, -1, -1):
             parts += [direction.sum(dim=1), _weight_gradient(self.layer_inputs[k], direction)]
@@ -154,7 +156,7 @@ class Pullback:
         return torch.cat(parts[::-1], dim=1)
 
     def on_inputs(self, direction: Tensor) -> Tensor:
-        """Gradient (L, N, D) of ``sum(direction * outputs)`` with respect to the inputs."""
+        """Gradient (L, N, D) of ``sum(direction * outputs)`` with respect to the inputs; direction (L, N, O)."""
         for k in range(len(self.layers) - 1, 0, -1):
             direction = self._through(k, direction)
         return _times_transpose(direction, self.layers[0][0])

@@ -71,7 +71,11 @@ class _StackedNetworks:
 
 
 class FastSac(SAC):
-    """``stable_baselines3.SAC`` for small ReLU networks, with a faster ``train``."""
+    """``stable_baselines3.SAC`` for small ReLU networks, with a faster ``train``.
+
+    Raises:
+        ConfigError: another feature extractor or activation, state-dependent exploration, or a fixed temperature.
+    """
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -113,7 +117,10 @@ class FastSac(SAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def learned_state(self) -> dict[str, Tensor | int]:
-        """A copy of networks, temperature and optimiser state on the CPU, from which training can continue."""
+        """A copy of networks, temperature and optimiser state by name on the CPU, from which training can continue.
+
+        Each tensor has the shape of the agent's own.
+        """
         assert self.log_ent_coef is not None
         state: dict[str, Tensor | int] = {
             f"policy/{name}": value.detach().cpu().clone() for name, value in self.policy.state_dict().items()
@@ -124,7 +131,7 @@ class FastSac(SAC):
         return state
 
     def load_learned_state(self, state: Mapping[str, Tensor | int]) -> None:
-        """Load the output of ``learned_state`` of an agent of the same shape."""
+        """Load the output of ``learned_state`` of an agent of the same shape. Raises RuntimeError for another shape."""
         assert self.log_ent_coef is not None
         self.policy.load_state_dict({name: state[f"policy/{name}"] for name in self.policy.state_dict()})
         self.log_ent_coef.data.copy_(torch.as_tensor(state["log_temperature"]))
@@ -132,7 +139,7 @@ class FastSac(SAC):
             adam.load({name: state[f"{adam_name}/{name}"] for name in adam.state()})
 
     def checked_state(self, arrays: Mapping[str, NDArray[np.generic]]) -> dict[str, Tensor | int]:
-        """The state in arrays of a file. Raises DataError if one is missing or does not fit this agent."""
+        """The state in arrays of a file. Raises DataError if one is missing or has another shape than this agent's."""
         return {
             name: checked_tensor(arrays, name, tuple(own.shape))
             if isinstance(own, Tensor)

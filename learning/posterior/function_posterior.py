@@ -115,7 +115,7 @@ class FunctionPosterior:
 
 
 def simulate(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser: Normaliser) -> Tensor:
-    """Normalised outputs (P, N, O) of the simulator, double precision."""
+    """Normalised outputs (P, N, O) of the simulator, double precision, at raw inputs (N, D) for parameters (P, K)."""
     if not len(inputs):
         return torch.zeros((len(parameters), 0, len(normaliser.output_std)), dtype=torch.float64, device=inputs.device)
     with torch.no_grad():

@@ -64,7 +64,7 @@ class ResidualDistribution:
         return Mixture(means, one, self.dof, self.whitening.to(means))
 
     def to(self, like: Tensor) -> ResidualDistribution:
-        """Copy with the type and device of another tensor."""
+        """Copy with the type and device of another tensor, of any shape."""
         return ResidualDistribution(self.factor.to(like), self.dof)
 
 

@@ -39,7 +39,7 @@ class Assignment:
         return cls(particle * share + rank, share)
 
     def reassigned(self, rows: Tensor, particles: int, generator: torch.Generator) -> Assignment:
-        """Copy with new random slots for some rows (indices), drawn among their slots and the free ones."""
+        """Copy with new random slots for the rows with indices (m,), drawn among their slots and the free ones."""
         taken = torch.zeros(self.share * particles, dtype=torch.bool)
         taken[self.slot] = True
         taken[self.slot[rows]] = False

@@ -67,7 +67,7 @@ class Sinusoids:
     """``a sin(w x) + b x`` with a ~ N(2, 0.4^2), w ~ U(1.7, 2.3), b ~ N(2, 1), for x in [-5, 5]."""
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """X (N, 1)."""
+        """Values of x (N, 1)."""
         return uniform(((-5.0, 5.0),), count, generator)
 
     @property
@@ -76,33 +76,40 @@ class Sinusoids:
         return 3
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """(a, w, b)."""
+        """a, w, b (P, 3) for standard normal draws (P, 3)."""
         a, w, b = normal.T
         return torch.stack([2.0 + 0.4 * a, 1.7 + 0.6 * torch.special.ndtr(w), 2.0 + b], dim=1)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Values (P, N, 1)."""
+        """Values (P, N, 1) at x (N, 1) for parameters (P, 3)."""
         a, w, b = (parameters[:, k, None] for k in range(3))
         x = inputs[None, :, 0]
         return (a * torch.sin(w * x) + b * x)[:, :, None]
 
 
 HiddenAcceleration = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""Missing angular acceleration [rad/s2] by angle [rad], rate [rad/s], commanded torque [N m] and inertia [kg m2]."""
+"""Missing angular acceleration (P, N) [rad/s2] by angle [rad] and rate [rad/s] (P, N), commanded torque (1, N) [N m],
+and inertia (P, 1) [kg m2]."""
 
 
 def detent(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
-    """A detent with three positions a turn: ``4 sin(3 theta)`` rad/s2."""
+    """A detent with three positions a turn: ``4 sin(3 theta)`` rad/s2; shapes as in ``HiddenAcceleration``."""
     return 4.0 * torch.sin(3.0 * angle)
 
 
 def saturated_torque(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
-    """A motor that saturates smoothly at 1 N m: its torque is ``tanh(command)``."""
+    """A motor that saturates smoothly at 1 N m: its torque is ``tanh(command)``.
+
+    Shapes as in ``HiddenAcceleration``.
+    """
     return (torch.tanh(torque) - torque) / inertia
 
 
 def position_friction(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
-    """Viscous friction that depends on the angle: ``(1 + cos theta)`` N m s, zero at the bottom."""
+    """Viscous friction that depends on the angle: ``(1 + cos theta)`` N m s, zero at the bottom.
+
+    Shapes as in ``HiddenAcceleration``.
+    """
     return -(1.0 + torch.cos(angle)) * rate / inertia
 
 
@@ -114,10 +121,13 @@ class Pendulum:
     their code (its square does not change sign with the rate) or, with ``dissipative``, ``rate |rate|``.
 
     Attributes:
-        masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu and drag.
+        masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu [N s] and drag [kg].
+        dissipative: whether the drag always brakes.
         rate_discrepancy: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing
             angular acceleration: a discrepancy process inside the dynamics, with a polynomial kernel.
         hidden_acceleration: further angular acceleration of a true system; None: zero.
+        period_s: duration of a step [s].
+        substeps: Euler steps in it.
     """
 
     masses: Range = (0.5, 1.5)
@@ -142,13 +152,13 @@ class Pendulum:
         return 8
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """(m, l, g, nu, drag, and three coefficients of the discrepancy)."""
+        """m, l, g, nu, drag and three coefficients of the discrepancy (P, 8), for standard normal draws (P, 8)."""
         ranges = (self.masses, self.lengths, self.gravities, self.frictions, self.drags)
         known = within(ranges, torch.special.ndtr(normal[:, :5]))
         return torch.cat([known, normal[:, 5:] * torch.tensor(self.rate_discrepancy).to(normal)], dim=1)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes (P, N, 3)."""
+        """Changes (P, N, 3) of sine, cosine and rate [rad/s] at inputs (N, 4) for parameters (P, 8)."""
         mass, length, gravity, friction, drag, linear, odd, even = (parameters[:, k, None] for k in range(8))
         angle = torch.atan2(inputs[:, 0], inputs[:, 1])[None]
         rate, torque = inputs[None, :, 2], inputs[None, :, 3]
@@ -170,8 +180,20 @@ class Pendulum:
 class KinematicCar:
     """Change over 1/30 s of (x, y, sin yaw, cos yaw, vx, vy in the world, yaw rate) of a car whose wheels do not slip.
 
-    ``beta = atan(l_r tan(d) / L)`` at the centre of mass; lateral velocity and yaw rate converge within a step. The
-    body is rotated by an unknown angle relative to the measured heading.
+    ``beta = atan(l_r tan(d) / L)`` at the centre of mass (Rajamani, "Vehicle Dynamics and Control", section 2.2);
+    lateral velocity and yaw rate converge within a step. The body is rotated by an unknown angle relative to the
+    measured heading.
+
+    Attributes:
+        masses: range of the mass [kg].
+        front_axles, rear_axles: ranges of l_f and l_r, the distances of the axles from the centre of mass [m].
+        offsets: range of the angle between body and measured heading [rad].
+        drives: range of the force at full throttle [N].
+        dampings: range of the square root of the damping [sqrt(N s/m)].
+        steerings: range of the wheel angle at full lock [rad].
+        period_s: duration of a step [s].
+        substeps: integration steps in it.
+        place_m, speed_mps, rate_radps: half widths of the domain of positions, velocities and yaw rates.
     """
 
     masses: Range = (1.6, 1.7)
@@ -200,12 +222,12 @@ class KinematicCar:
         return 7
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """(m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock)."""
+        """m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock (P, 7); normal draws (P, 7)."""
         ranges = (self.masses, self.front_axles, self.rear_axles, self.offsets, self.drives, self.dampings)
         return within((*ranges, self.steerings), torch.special.ndtr(normal))
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes (P, N, 7)."""
+        """Changes (P, N, 7) at inputs (N, 9) for parameters (P, 7)."""
         mass, front, rear, offset, drive, damping, lock = (parameters[:, k, None] for k in range(7))
         yaw = torch.atan2(inputs[:, 2], inputs[:, 3])[None] + offset
         throttle = inputs[None, :, 8].clamp(-1.0, 1.0)

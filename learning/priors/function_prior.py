@@ -50,6 +50,8 @@ class Marginal:
 class RbfCovariance:
     """Covariance of a zero-mean Gaussian process, one for each output: ``scale_o^2 exp(-|a - b|^2 / (2 l^2))``.
 
+    Squared exponential covariance (Rasmussen and Williams 2006, equation 4.9).
+
     Attributes:
         scales: standard deviation of each output.
         lengthscales: one for each input, or one for all.

@@ -64,14 +64,17 @@ class MotorPendulum:
         return 13
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """(m, l, g, nu, drag, dry, lag; coefficients of rate, rate |rate|, rate^2, sign, command, past command)."""
+        """m, l, g, nu, drag, dry, lag; coefficients of rate, rate |rate|, rate^2, sign, command, past command.
+
+        Parameters (P, 13) for standard normal draws (P, 13).
+        """
         ranges = (self.masses, self.lengths, self.gravities, self.frictions, self.drags, self.dry, self.lags)
         known = within(ranges, torch.special.ndtr(normal[:, :7]))
         sizes = torch.tensor([*self.rate_discrepancy, self.command_discrepancy, self.command_discrepancy]).to(normal)
         return torch.cat([known, normal[:, 7:] * sizes], dim=1)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes (P, N, 3)."""
+        """Changes (P, N, 3) of sine, cosine and rate [rad/s] at inputs (N, 5) for parameters (P, 13)."""
         mass, length, gravity, friction, drag, dry, lag, *discrepancy = (
             parameters[:, k, None] for k in range(self.size)
         )

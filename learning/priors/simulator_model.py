@@ -70,6 +70,9 @@ class CarModel:
             All other parameters are fixed.
         at_s: time since a recording's first row at which time-dependent effects are evaluated [s].
         velocity_delay_s: delay of measured velocities relative to measured poses [s].
+
+    Raises:
+        ConfigError: a range of an unknown parameter, or of a choice.
     """
 
     config: SimulatorConfig
@@ -151,7 +154,7 @@ class CarModel:
         return plausible[torch.arange(count) % len(plausible)] if len(plausible) < count else plausible[:count]
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes (P, N, 6) over one step for inputs (N, D) and parameters (P, K)."""
+        """Changes (P, N, 6) over one step for inputs (N, D) and parameters (P, K), in ``transitions.OUTPUTS``."""
         sets, count = len(parameters), len(inputs)
         start = torch.cat([torch.zeros_like(inputs[:, :3]), inputs[:, :3]], dim=1)
         commands = inputs[:, 3:].view(count, self.history + 1, 2)

@@ -46,7 +46,7 @@ class StepInBody(ABC):
         """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) one step later."""
+        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
         return advance(features, action, self.sample(inputs_of(features, action), generator))
 
 
@@ -76,11 +76,15 @@ class CarDynamics(StepInBody):
         return self.posterior.predict(inputs)
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """One sample (N, 6) of the mixture for each row."""
+        """One sample (N, 6) of the mixture for each row of inputs (N, 3 + 2 (H + 1))."""
         return self._sampler(inputs, generator)
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
-        """Negative log-likelihood of an episode's steps [nat per step], and calibration error."""
+        """Negative log-likelihood of an episode's steps [nat per step], and calibration error.
+
+        Raises:
+            DataError: the episode has no complete step.
+        """
         rows = transitions_of([episode], self.history)
         inputs, outputs = (torch.from_numpy(v).to(self.posterior.parameters) for v in (rows.inputs, rows.targets))
         predicted = self.predict(inputs).smoothed()

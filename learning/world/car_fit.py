@@ -104,7 +104,9 @@ def fit_car(
         progress: called with the number of optimiser steps done.
 
     Raises:
-        DataError: the rows or the earlier fit have another history than the model, or the fit diverged.
+        DataError: the rows or the earlier fit have another history than the model, or numbers are missing or infinite,
+            or the simulator gives no plausible outputs.
+        DivergedError: the particles diverged.
     """
     if rows is not None and rows.history != model.history:
         raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; use the same number.")

@@ -62,7 +62,7 @@ class DisturbanceProcess:
 
 
 def change_by(acceleration: Tensor, period_s: float) -> Tensor:
-    """Changes (N, 6) over a step, in the order of ``transitions.OUTPUTS``, by accelerations (N, 3)."""
+    """Changes (N, 6) over a step, in the order of ``transitions.OUTPUTS``, by accelerations (N, 3) in ``CHANNELS``."""
     return torch.cat([0.5 * period_s**2 * acceleration, period_s * acceleration], dim=1)
 
 
@@ -96,7 +96,7 @@ class Rollouts(Protocol):
         ...
 
     def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Start other rollouts in place of those with indices ``rows``."""
+        """Start other rollouts in place of those with indices ``rows`` (M,)."""
         ...
 
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
@@ -111,14 +111,14 @@ class IndependentSteps:
     model: OneStep
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """As ``Rollouts``."""
+        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
         return self.model.step(features, action, generator)
 
     def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """As ``Rollouts``: nothing is kept between steps."""
+        """Do nothing for ``rows`` (M,): no state lasts from step to step."""
 
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """As ``Rollouts``: none."""
+        """None: the steps contain the noise (N, 6)."""
         return None
 
 
@@ -133,7 +133,7 @@ class DisturbedRollouts:
         self._scale = torch.tensor(model.process.scale)
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """As ``Rollouts``."""
+        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
         process = self._model.process
         change = self._sampler.without_noise(inputs_of(features, action), self._assignment)
         acceleration = self._scale * self._tail_factor * self._unit
@@ -142,12 +142,12 @@ class DisturbedRollouts:
         return advance(features, action, change)
 
     def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """As ``Rollouts``."""
+        """Start other rollouts in place of those with indices ``rows`` (M,)."""
         self._assignment = self._assignment.reassigned(rows, len(self._sampler.parameters), generator)
         self._unit[rows], self._tail_factor[rows] = self._model.process.initial(len(rows), generator)
 
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """As ``Rollouts``: noise of the one-step likelihood."""
+        """Noise (N, 6) of the one-step likelihood, in the order of ``transitions.OUTPUTS``."""
         return self._sampler.noise_samples(len(self._unit), generator)
 
 

@@ -40,13 +40,13 @@ Times = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class RolloutErrors:
-    """Errors of undisturbed rollouts at N = windows x horizons, for each of six outputs.
+    """Errors of undisturbed rollouts at N = windows x horizons, for x, y [m], yaw [rad] and the body velocities.
 
     Attributes:
         error: of the particles' mean path (N, 6).
         variance: of the particles' paths and of the measurement noise (N, 6).
-        pulses: responses to unit pulses of each channel at each step (N, 6, K, 3).
-        period_s: period of the steps.
+        pulses: responses to accelerations of 1 m/s2 or 1 rad/s2 during one of the K steps, by channel (N, 6, K, 3).
+        period_s: period of the steps [s].
     """
 
     error: Tensor

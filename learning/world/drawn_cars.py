@@ -89,10 +89,10 @@ class DrawnRollouts:
         return encoded
 
     def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Keep the cars: their hidden states follow from the features."""
+        """Keep the cars for ``rows`` (M,): their hidden states follow from the features."""
 
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """None: the states are exact."""
+        """None, without noise (N, 6): the states are exact."""
         return None
 
 
@@ -145,7 +145,9 @@ def _sizes(
 
 
 def select_cars(cars: DrawnCars, episodes: Sequence[EpisodeData], count: int) -> DrawnCars:
-    """The ``count`` cars with the smallest prediction errors over recorded windows (rejection ABC).
+    """The ``count`` cars with the smallest prediction errors over recorded windows.
+
+    Rejection ABC (Beaumont, Zhang and Balding 2002, "Approximate Bayesian computation in population genetics").
 
     Args:
         cars: drawn from the prior.

@@ -55,6 +55,9 @@ def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoic
 
     Returns:
         The choice; None with fewer than ``MIN_ROWS`` rows.
+
+    Raises:
+        DataError: the recordings hold enough ticks, but no complete step.
     """
     longest = CANDIDATE_LENGTHS[-1]
     if sum(max(e.ticks - longest, 0) for e in episodes) < MIN_ROWS:

@@ -114,7 +114,10 @@ class ModelEnv(VecEnv):
         self._arena_m = self._envelope.arena_m or task.arena_m
 
     def reset(self) -> NDArray[np.float32]:
-        """Start all cars. Their episodes end at different ticks, so that no batch consists of start states."""
+        """Start all cars; returns policy inputs (cars, 7 + 2 H).
+
+        Their episodes end at different ticks, so that no batch consists of start states.
+        """
         self._start(np.arange(self.num_envs))
         self._ticks = self._rng.integers(self._task.max_ticks, size=self.num_envs)
         return self._policy_inputs()
@@ -124,7 +127,12 @@ class ModelEnv(VecEnv):
         self._actions = torch.as_tensor(actions, dtype=torch.float32).to(self._device)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """One step of every car; a car whose episode ends starts again."""
+        """One step of every car; a car whose episode ends starts again.
+
+        Returns:
+            Policy inputs (cars, 7 + 2 H), rewards times ``REWARD_SCALE`` (cars,), mask of ended episodes (cars,), and
+            one dictionary for each car.
+        """
         before = self._features
         with torch.no_grad():
             action = self._gate(before, self._actions)
@@ -154,7 +162,7 @@ class ModelEnv(VecEnv):
         """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
-            act: actions (cars, 2) for policy inputs (cars, F).
+            act: actions (cars, 2) for policy inputs (cars, 7 + 2 H).
             max_ticks: length of the episode; by default that of the task.
 
         Returns:

@@ -47,7 +47,7 @@ def seven_outputs(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) ->
 
 
 def measured_seven_outputs(changes: Tensor, velocity_mps: Tensor, yaw_rad: Tensor) -> Tensor:
-    """The seven outputs (N, 7) of measured changes (N, 6)."""
+    """The seven outputs (N, 7) of measured changes (N, 6); velocity (N, 2) and yaw (N,) as for ``seven_outputs``."""
     exact = Mixture(changes[None], torch.zeros_like(changes[None]))
     return seven_outputs(exact, velocity_mps, yaw_rad).means[0]
 

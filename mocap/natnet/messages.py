@@ -117,7 +117,8 @@ def encode_connect(
 ) -> bytes:
     """Payload of CONNECT (or DISCOVERY): 269 bytes with the options of NatNet 4, 264 without them.
 
-    ``bitstream`` None requests the server's native version.
+    ``bitstream`` None requests the server's native version. Raises ProtocolError for a name that is too long or has a
+    NUL.
     """
     sender = _sender(name, app_version, natnet_version)
     if not options:
@@ -138,7 +139,7 @@ def decode_connect(payload: bytes) -> Connect:
 
 
 def encode_server_info(info: ServerInfo) -> bytes:
-    """Payload of SERVERINFO, 279 bytes."""
+    """Payload of SERVERINFO, 279 bytes. Raises ProtocolError for a name that is too long or has a NUL."""
     group = bytes(int(part) for part in info.multicast_group.split(".")) if info.multicast_group else bytes(4)
     tail = _INFO.pack(info.clock_hz, info.data_port, info.is_multicast, group)
     return _sender(info.name, info.app_version, info.natnet_version) + tail

@@ -24,7 +24,7 @@ class Past(NamedTuple):
 
     @classmethod
     def of(cls, commands: torch.Tensor | None, states: torch.Tensor | None, like: torch.Tensor) -> Past | None:
-        """Create a history from commands and states; None without ticks before the first."""
+        """Create a history from commands (N, H, 2) and states (N, H, 6), in the dtype of ``like``; None if H is 0."""
         if commands is None or not commands.shape[1]:
             return None
         return cls(commands.to(like), None if states is None else states.to(like))
@@ -35,7 +35,7 @@ class Past(NamedTuple):
 
 
 def number_if_shared(value: Number) -> Number:
-    """Convert a tensor without gradient whose value is the same for all cars to a float; otherwise return it."""
+    """Convert a tensor () or (N,) without gradient and with equal values to a float; otherwise return it."""
     if isinstance(value, torch.Tensor) and not value.requires_grad:
         first = value.reshape(-1)[0] if value.numel() else value.new_zeros(())
         if bool((value == first).all()):
@@ -74,7 +74,17 @@ def check_shapes(
     history: torch.Tensor | None,
     history_states: torch.Tensor | None,
 ) -> int:
-    """Check shapes and return the number of cars. Raises DataError for a wrong shape."""
+    """Check shapes and return the number of cars N.
+
+    Args:
+        start: (N, 6).
+        commands: (N, T, 2).
+        history: (N, H, 2).
+        history_states: (N, H, 6).
+
+    Raises:
+        DataError: A wrong shape.
+    """
     cars = int(start.shape[0])
     if start.ndim != 2 or start.shape[1] != 6:
         raise DataError(f"start has shape {tuple(start.shape)}; it must be (cars, 6).")
@@ -89,7 +99,7 @@ def check_shapes(
 
 
 def check_values(given: Mapping[str, Number], t0_s: Number, cars: int) -> None:
-    """Raise ConfigError for unknown or unsupported names, DataError for wrong shapes."""
+    """Raise ConfigError for unknown or unsupported names, DataError for shapes other than () and (cars,)."""
     check_keys(given, REGISTRY, "the values of a rollout")
     if "timing.control_period" in given:
         raise ConfigError("timing.control_period is shared by all cars; change it in the simulator instead.")

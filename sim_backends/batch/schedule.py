@@ -21,21 +21,22 @@ import torch
 from sim_backends.dynamics.integrate import substeps_for
 
 Number: TypeAlias = "float | torch.Tensor"
+"""A number for all cars, or a tensor of shape () or (N,)."""
 _TOLERANCE_S = 1e-9
 """Difference below which two instants are equal [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of a control period. Flags are for all cars or one per car."""
+    """A piece of a control period, from ``start_s`` [s] in it. Flags are for all cars or one per car (N,)."""
 
     start_s: Number
     length_s: Number
     steps: int
     new_command: tuple[bool | torch.Tensor, bool | torch.Tensor]
-    """Whether the later of the period's two commands acts, for steering and throttle."""
+    """Whether the later of the period's two commands acts, for steering and throttle; each for all cars or (N,)."""
     has_capture: bool | torch.Tensor
-    """Whether a capture lies in this piece."""
+    """Whether a capture lies in this piece, for all cars or (N,)."""
     capture_after_s: Number | None
     """Time of the capture after the start of the piece [s]; None at its end."""
     capture_steps: int
@@ -43,7 +44,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class PeriodPlan:
-    """The pieces of each period, and the delays of commands and poses in whole periods."""
+    """The pieces of each period, and the delays of commands and poses in whole periods, for all cars or (N,)."""
 
     pieces: tuple[Piece, ...]
     command_periods: tuple[int | torch.Tensor, int | torch.Tensor]
@@ -53,7 +54,7 @@ class PeriodPlan:
 def plan_period(period_s: float, delays_s: tuple[Number, Number], latency_s: Number, max_step_s: float) -> PeriodPlan:
     """Cut a control period for the delays of steering and throttle and the latency of measurements [s].
 
-    Delays and latency are numbers or one per car, and not negative. A latency of zero needs no extra steps.
+    Delays and latency are numbers or one per car (N,), and not negative. A latency of zero needs no extra steps.
     """
     if any(isinstance(v, torch.Tensor) for v in (*delays_s, latency_s)):
         return _plan_per_car(period_s, delays_s, latency_s, max_step_s)

@@ -121,14 +121,14 @@ def compile_gradient(key: Key, wanted: tuple[bool, ...], dtype: np.dtype[Any]) -
 
 
 class Row(NamedTuple):
-    """A row of a matrix of one value per car and row; its address follows from that of the matrix."""
+    """A row of a matrix (rows, cars); its address follows from that of the matrix."""
 
     matrix: Value
     number: int
 
     @property
     def value(self) -> Value:
-        """The row."""
+        """The row (cars,)."""
         return self.matrix[self.number]
 
 
@@ -136,9 +136,11 @@ class Segment(NamedTuple):
     """An interval with held commands."""
 
     t_s: Value
-    """Time at its start."""
+    """Time at its start [s], () or (cars,)."""
     commands: tuple[Row, Row]
+    """Steering and throttle in [-1, 1]."""
     step_s: Value
+    """Length of an integration step [s], () or (cars,)."""
     steps: int
     for_measurement: bool = False
     """Whether the segment only leads to a capture: the next one starts where this one started."""
@@ -150,7 +152,7 @@ class CompiledCars:
     Args:
         kind: Form of the model.
         effects: Ids of its effects.
-        values: Numbers by dotted name, rows of one value per car.
+        values: Numbers by dotted name, rows (cars,).
         has_filter: Whether measured velocities are filtered.
     """
 
@@ -164,7 +166,12 @@ class CompiledCars:
         self._rows = _Rows(max(self._cars, vector_length(self._dtype)), self._dtype)
 
     def run(self, carried: Sequence[Value], segments: Sequence[Segment]) -> list[tuple[Value, ...]]:
-        """Advance ``carried`` through the segments, and return it at the end of each."""
+        """Advance ``carried`` through the segments, and return it at the end of each.
+
+        Args:
+            carried: Rows (cars,): the state of the car, of its actuators, and the filtered velocities if any.
+            segments: In the order of time.
+        """
         if self._on_arrays:
             ends = _run(self._key, self._parameters, carried, segments, self._rows)
             return [tuple(block) for block in ends[:, :, : self._cars]]

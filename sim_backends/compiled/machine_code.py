@@ -75,7 +75,11 @@ class MachineCode:
     """Keeps the code in memory."""
 
     def run(self, inputs: Sequence[FloatRow], count: int) -> FloatRow:
-        """``count`` output rows of a function that has no segments."""
+        """Output rows (count, cars) of a function that has no segments, from input rows (cars,).
+
+        Raises:
+            ValueError: The rows are shorter than ``vector_length``.
+        """
         cars, least = len(inputs[0]), vector_length(inputs[0].dtype)
         if cars < least:
             raise ValueError(f"A compiled function needs rows of at least {least} numbers.")
@@ -94,7 +98,7 @@ class SegmentTable:
 
 
 def addresses(rows: Iterable[FloatRow]) -> NDArray[np.uint64]:
-    """The table of the addresses of contiguous rows."""
+    """The table (rows,) of the addresses of contiguous rows (cars,)."""
     return np.array([row.__array_interface__["data"][0] for row in rows], np.uint64)
 
 

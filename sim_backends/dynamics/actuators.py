@@ -12,7 +12,7 @@ from sim_backends.effects.base import Parameters, Triple
 MAX_STORED_LENGTHS = 8
 """Number of step lengths whose numbers are stored; a rollout has at most three pieces a period."""
 ActuatorState = tuple[Value, ...]
-"""One value per effect with memory, steering's first."""
+"""One value per effect with memory, steering's first: a wheel angle [rad] or a throttle [1], shape () or (cars,)."""
 
 
 class ActuatorChain:
@@ -34,7 +34,7 @@ class ActuatorChain:
         self._by_length: dict[Any, tuple[Value, list[Parameters]]] = {}
 
     def settled(self, commands: tuple[Value, Value]) -> ActuatorState:
-        """Steady state of the actuators for constant ``commands``."""
+        """Steady state of the actuators for constant commands of steering and throttle in [-1, 1]."""
         signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
         memory = []
         for effect, values in self._links:
@@ -46,7 +46,7 @@ class ActuatorChain:
         return tuple(memory)
 
     def settled_output(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
-        """Steady wheel angle [rad] and throttle [1] for constant ``commands``."""
+        """Steady wheel angle [rad] and throttle [1] for constant commands of steering and throttle in [-1, 1]."""
         signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
         for effect, values in self._links:
             if not effect.has_state:
@@ -56,7 +56,13 @@ class ActuatorChain:
     def step(
         self, commands: tuple[Value, Value], memory: ActuatorState, step_s: Value
     ) -> tuple[tuple[Triple, Triple], ActuatorState]:
-        """Wheel angle and throttle at start, middle and end of a step with held commands, and the state at its end."""
+        """Wheel angle [rad] and throttle [1] at start, middle and end of a step with held commands; state at its end.
+
+        Args:
+            commands: Steering and throttle in [-1, 1].
+            memory: State at the start.
+            step_s: Length of the step [s].
+        """
         angle = self._max_angle * commands[0]
         signals: dict[str, Triple] = {"steering": (angle, angle, angle), "throttle": (commands[1],) * 3}
         left = iter(memory)

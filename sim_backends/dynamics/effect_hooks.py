@@ -47,7 +47,7 @@ class EffectHooks:
         self.states = tuple(f"{e.id}.{name}" for e in dynamics for name in e.states)
 
     def base_model(self, kind: ModelKind, tyre: Mapping[str, Value]) -> tuple[ModelKind, Mapping[str, Value]]:
-        """Kind of the base model and its tyre parameters, as changed by the effects."""
+        """Kind of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...) [1], as changed by the effects."""
         for effect in self._effects:
             kind, tyre = effect.base_model(kind, tyre, self.values[effect.id])
         return kind, tyre
@@ -62,7 +62,13 @@ class EffectHooks:
             hook(self._ops, forces, values)
 
     def before_tyres(self, forces: Forces, damping: Value, settle: bool) -> None:
-        """Evaluate all forces except the tyres' side forces."""
+        """Evaluate all forces except the tyres' side forces.
+
+        Args:
+            forces: Inputs; the forces are written into it.
+            damping: Decrease of the motor force per speed [N s/m].
+            settle: Compute the steady extra states instead of reading them.
+        """
         for name in ("on_load", "on_grip", "on_drive"):
             self.run(name, forces)
         if self.has_transfer:  # until here it is the shape of the front's side force

@@ -24,8 +24,9 @@ def rk4_step(
 ) -> State:
     """One classical fourth-order Runge-Kutta step with the actuation given at its start, middle and end.
 
-    ``step_s`` is a number or one per car. If no effect depends on the position, x and y are omitted in the stages,
-    since they are pure integrals. Effects with stiff states integrate these by their own methods.
+    ``t_s`` and ``step_s`` [s] are numbers or one per car (cars,). If no effect depends on the position, x and y are
+    omitted in the stages, since they are pure integrals. Effects with stiff states integrate these by their own
+    methods.
     """
     ops = model.ops
     half_s = 0.5 * step_s
@@ -88,7 +89,7 @@ def integrate_held(
         state: State at the start.
         memory: State of the actuators at the start.
         commands: Acting steering and throttle in [-1, 1].
-        step_s: A number or one per car.
+        step_s: Length of a step [s], a number or one per car (cars,).
         steps: Number of Runge-Kutta steps.
 
     Returns:

@@ -13,7 +13,14 @@ from sim_backends.dynamics.integrate import MAX_STEP_S, substeps_for
 
 
 def derivative(state: FloatArray, steering: float, throttle: float, p: CarParameters) -> FloatArray:
-    """Derivative of ``[x, y, yaw, vx, vy, yaw_rate]`` by the dynamic single-track model with Pacejka tyres."""
+    """Derivative (6,) of a state (6,) by the dynamic single-track model with Pacejka tyres (``single_track``).
+
+    Args:
+        state: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+        steering: In [-1, 1].
+        throttle: In [-1, 1].
+        p: Parameters of the car.
+    """
     _, _, yaw, vx, vy, r = state
     d = p.max_angle_rad * steering
     wheelbase = p.front_axle_m + p.rear_axle_m
@@ -40,7 +47,7 @@ def derivative(state: FloatArray, steering: float, throttle: float, p: CarParame
 
 
 def rk4(state: FloatArray, steering: float, throttle: float, p: CarParameters, step_s: float) -> FloatArray:
-    """One Runge-Kutta step with held commands."""
+    """State (6,) after one classical fourth-order Runge-Kutta step from a state (6,) with held commands in [-1, 1]."""
     k1 = derivative(state, steering, throttle, p)
     k2 = derivative(state + 0.5 * step_s * k1, steering, throttle, p)
     k3 = derivative(state + 0.5 * step_s * k2, steering, throttle, p)

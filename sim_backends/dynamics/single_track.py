@@ -28,11 +28,16 @@ AXLES = ("front", "rear")
 
 NO_STIFF_STEPS: Mapping[str, StiffStep] = MappingProxyType({})
 State = tuple[Value, ...]
-"""x, y, yaw, vx, vy, yaw rate, then the extra states of effects; each shape () or (cars,)."""
+"""x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s], then the extra states of effects; each shape () or (cars,)."""
 
 
 class Actuation(NamedTuple):
-    """Input of the dynamics at one instant: front wheel angle [rad], its sine and cosine, throttle [1]."""
+    """Input of the dynamics at one instant; each shape () or (cars,).
+
+    Attributes:
+        angle, sin, cos: front wheel angle [rad], its sine and cosine.
+        throttle: [1].
+    """
 
     angle: Value
     sin: Value
@@ -85,7 +90,7 @@ class SingleTrack:
         self.rear_stiffness = self.rear_b * self.rear_c
 
     def actuation(self, angle: Value, throttle: Value) -> Actuation:
-        """Bundle a wheel angle [rad] and a throttle with the angle's sine and cosine."""
+        """Bundle a wheel angle [rad] and a throttle [1] with the angle's sine and cosine."""
         return Actuation(angle, self.ops.sin(angle), self.ops.cos(angle), throttle)
 
     def derivative(
@@ -95,7 +100,7 @@ class SingleTrack:
         return self.evaluate(t_s, state, actuation, stiff)[0]
 
     def settled(self, t_s: Value, body: State, actuation: Actuation) -> State:
-        """Steady extra states for a constant motion of the body (six values) and a constant actuation."""
+        """Steady extra states at ``t_s`` [s] for a constant motion of the body (six values) and constant actuation."""
         if not self.extra_states:
             return ()
         _, forces = self.evaluate(t_s, body, actuation, settle=True)
@@ -113,7 +118,7 @@ class SingleTrack:
         """The derivative and, if there are dynamics effects, all forces.
 
         Args:
-            t_s: Time [s].
+            t_s: Time since the first row of the recording [s].
             state: State; with ``settle`` its first six values.
             actuation: Wheel angle and throttle.
             stiff: Within a Runge-Kutta step: the steps of stiff states by effect id.

@@ -10,7 +10,7 @@ from sim_backends.array_ops import Ops, Value
 
 
 class TorchOps:
-    """Tensors of one dtype on one device; every function is differentiable."""
+    """Tensors of one dtype on one device, element by element; every function is differentiable."""
 
     sin = staticmethod(torch.sin)
     cos = staticmethod(torch.cos)

@@ -7,7 +7,8 @@
 * O, observation: acts on what is measured (``ObservationEffect``).
 
 An effect stores no numbers: its parameters are arguments of each call, as floats or as one value per car. So simulator,
-system identification and the prior over simulators treat them like every other parameter.
+system identification and the prior over simulators treat them like every other parameter. Each value has the shape ()
+or (cars,), and every method acts element by element.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ SLIP_FLOOR_MPS = 0.3
 """Minimum speed in the denominator of a slip or a slip angle [m/s]."""
 
 Parameters = Mapping[str, Value]
+"""Numbers of an effect by name, in the unit of each ``EffectParameter``."""
 Triple = tuple[Value, Value, Value]
 """A signal at the start, the middle and the end of an integration step."""
 Kind = Literal["input", "dynamics", "observation"]
@@ -173,7 +175,7 @@ class DelayEffect(Effect):
         return "extra_delays_s"
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
-        """Seconds added to the delay of steering and of throttle."""
+        """Additional delay of steering and of throttle [s]."""
         raise NotImplementedError
 
 
@@ -188,28 +190,29 @@ class ActuatorEffect(Effect):
         return "step" if self.has_state else "apply"
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Output of an effect without memory."""
+        """Output of an effect without memory, in the unit of the command: wheel angle [rad] or throttle [1]."""
         raise NotImplementedError
 
     def step_numbers(self, ops: Ops, duration_s: Value, values: Parameters) -> Parameters:
-        """The numbers that ``step`` gets for steps of ``duration_s``, computed once for each length: its parameters.
+        """The numbers that ``step`` gets for steps of ``duration_s`` [s], computed once for each length.
 
-        Override it to add what depends on parameters and length alone.
+        They are the effect's parameters. Override it to add what depends on parameters and length alone.
         """
         return values
 
     def step(
         self, ops: Ops, command: Triple, state: Value, duration_s: Value, values: Parameters
     ) -> tuple[Triple, Value]:
-        """Output over a step of ``duration_s`` and the state at its end, for an effect with memory.
+        """Output over a step of ``duration_s`` [s] and the state at its end, for an effect with memory.
 
-        ``values`` are those of ``step_numbers``. ``command[0]`` is the value just after the start. A held command has
-        the same object three times.
+        Output and state are in the unit of the command: wheel angle [rad] or throttle [1]. ``values`` are those of
+        ``step_numbers``. ``command[0]`` is the value just after the start. A held command has the same object three
+        times.
         """
         raise NotImplementedError
 
     def settled(self, command: Value) -> Value:
-        """Steady state for a constant ``command``."""
+        """Steady state for a constant ``command``, in the unit of the command."""
         return command
 
 
@@ -219,11 +222,13 @@ class Forces:
 
     Units: t_s [s] since the first row of the recording, positions [m], velocities [m/s, rad/s] in the body frame,
     forces [N] in the body frame (side forces in the wheel frame, positive left), moment [N m] about the centre of
-    mass, wheel_angle [rad]. ``drive`` is the motor's force, ``axle_force`` the F_x of the driven axle (drive less
-    damping), ``demand`` the same before wheel slip, ``force_x`` all longitudinal forces but the tyres' side forces.
-    ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are the extra
-    states of effects by name; an effect puts their time derivatives into ``rates``. ``stiff`` has, within a
-    Runge-Kutta step, the ``StiffStep`` of each effect with stiff states, by effect id.
+    mass, wheel_angle [rad], throttle [1], mass [kg], loads of the axles [N], friction coefficients ``grip_front`` and
+    ``grip_rear`` [1]. ``front_axle`` and ``rear_axle`` are distances from the centre of mass [m]. ``drive`` is the
+    motor's force, ``axle_force`` the F_x of the driven axle (drive less damping), ``demand`` the same before wheel
+    slip, ``force_x`` all longitudinal forces but the tyres' side forces. ``front_per_load`` is the steady side force of
+    the front axle for each newton of its load. ``states`` are the extra states of effects by name; an effect puts their
+    time derivatives into ``rates``. ``stiff`` has, within a Runge-Kutta step, the ``StiffStep`` of each effect with
+    stiff states, by effect id.
     """
 
     t_s: Value
@@ -276,7 +281,7 @@ class StiffStep(Protocol):
     """One Runge-Kutta step of an effect's stiff states; its effect's hooks find it in ``Forces.stiff``."""
 
     def finish(self) -> dict[str, Value]:
-        """The stiff states at the end of the step, by name."""
+        """The stiff states at the end of the step by name, each () or (cars,)."""
 
 
 class DynamicsEffect(Effect):
@@ -297,7 +302,7 @@ class DynamicsEffect(Effect):
     def base_model(
         self, kind: ModelKind, tyre: Mapping[str, Value], values: Parameters
     ) -> tuple[ModelKind, Mapping[str, Value]]:
-        """Change the form of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...)."""
+        """Change the form of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...) [1]."""
         return kind, tyre
 
     def required_method(self) -> str:
@@ -330,7 +335,7 @@ class DynamicsEffect(Effect):
         """Change ``side_front`` and ``side_rear``."""
 
     def on_motion(self, ops: Ops, forces: Forces, acceleration_mps2: Value, values: Parameters) -> None:
-        """Set rates that depend on dvx/dt."""
+        """Set rates that depend on dvx/dt [m/s2]."""
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
         """Steady states for constant ``forces`` (all forces evaluated), by name."""
@@ -348,7 +353,7 @@ class ObservationEffect(Effect):
     """Whether ``observe`` changes the velocity columns alone, so that velocities from measured poses are true."""
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Measured x, y, yaw, vx, vy, yaw rate of a true state."""
+        """Measured x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s] of a true state in the same order."""
         return state
 
     def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:

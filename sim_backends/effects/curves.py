@@ -87,7 +87,7 @@ class MeasuredCurve(Effect):
         return {_name(place): value for place, value in grid.items()}
 
     def deviation(self, ops: Ops, coordinates: Sequence[Value], coefficients: Mapping[str, Value]) -> Value:
-        """The deviation at ``coordinates``, one value for each axis."""
+        """The deviation in ``unit`` at ``coordinates``, one value () or (cars,) for each axis in its unit."""
         if (listener := _LISTENER.get()) is not None:
             listener(self, coordinates)
         clipped = [
@@ -103,11 +103,11 @@ class MeasuredCurve(Effect):
         return _polynomial(ops, clipped[1], columns)
 
     def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
-        """The base model's curve at ``coordinates``, from numbers by dotted name."""
+        """The base model's curve (...) in ``unit`` at ``coordinates``, each (...), from numbers by dotted name."""
         raise NotImplementedError
 
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """The inputs of the curve for a state of the car."""
+        """The inputs of the curve for a state of the car: one value for each axis in its unit."""
         raise NotImplementedError
 
     def table(self, values: Mapping[str, float]) -> list[Any]:
@@ -198,7 +198,11 @@ def _polynomial(ops: Ops, clipped: Sequence[Value], coefficients: Sequence[Value
 
 
 def weights(ops: Ops, x: Value, knots: Sequence[float]) -> list[Value]:
-    """Weights of the knots for linear interpolation at ``x``, constant beyond the last knots; they add up to 1."""
+    """Weights of the knots for linear interpolation at ``x``, constant beyond the last knots; they add up to 1.
+
+    Returns:
+        One weight for each knot, in the shape of ``x``.
+    """
     shares = [ops.clip((x - low) * (1.0 / (high - low)), 0.0, 1.0) for low, high in itertools.pairwise(knots)]
     return [1.0 - shares[0], *(a - b for a, b in itertools.pairwise(shares)), shares[-1]]
 
@@ -228,11 +232,11 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
     )
 
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """Throttle and vx."""
+        """Throttle [1] and vx [m/s]."""
         return forces.throttle, forces.vx
 
     def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
-        """Gain minus damping, per mass [m/s2]."""
+        """Drive force less damping, per mass of the car [m/s2]."""
         throttle, vx = coordinates
         force = values["motor.drive_gain"] * throttle - values["motor.damping"] * vx
         return np.asarray(force / values["vehicle.mass"])
@@ -256,7 +260,7 @@ class SteeringCurve(MeasuredCurve, ActuatorEffect):
     axes = (Axis("commanded angle", "rad", (-0.5, -0.35, -0.2, -0.1, 0.0, 0.1, 0.2, 0.35, 0.5), anchor=0.0),)
 
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """The commanded wheel angle."""
+        """The commanded wheel angle [rad]."""
         return (forces.wheel_angle,)
 
     def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
@@ -286,7 +290,7 @@ class _SideForceMap(MeasuredCurve, DynamicsEffect):
         raise NotImplementedError
 
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """F_x per mass of the car, and size of the slip angle."""
+        """F_x per mass of the car [m/s2], and size of the slip angle [rad]."""
         return self._at(ops, forces, self.slip_rad(ops, forces))
 
     def _at(self, ops: Ops, forces: Forces, slip_rad: Value) -> tuple[Value, ...]:
@@ -298,7 +302,7 @@ class _SideForceMap(MeasuredCurve, DynamicsEffect):
         return np.asarray(mu * np.sin(c * np.arctan(b * coordinates[-1])))
 
     def added(self, ops: Ops, forces: Forces, values: Parameters) -> Value:
-        """Side force per load to the left."""
+        """Deviation of the side force per load [1], positive left."""
         slip = self.slip_rad(ops, forces)
         return -ops.sign(slip) * self.deviation(ops, self._at(ops, forces, slip), values)
 

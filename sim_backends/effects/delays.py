@@ -24,7 +24,7 @@ class CommandDelay(DelayEffect):
     )
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
-        """Same for both."""
+        """The same delay for both [s]."""
         return values["extra_delay"], values["extra_delay"]
 
 
@@ -49,7 +49,7 @@ class SteeringDelay(DelayEffect):
     )
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
-        """Steering alone."""
+        """A delay of the steering alone [s]."""
         return values["delay"], 0.0
 
 
@@ -73,5 +73,5 @@ class ThrottleDelay(DelayEffect):
     )
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
-        """Throttle alone."""
+        """A delay of the throttle alone [s]."""
         return 0.0, values["delay"]

@@ -18,7 +18,7 @@ _MIN_RATIO = 1e-3
 
 
 class LagWeights(NamedTuple):
-    """Weights for the output at start, middle and end of a step."""
+    """Weights [1] for the output at start, middle and end of a step; each () or (cars,)."""
 
     start: Value
     """Weight of the old output in the effective output at the start.
@@ -32,12 +32,12 @@ class LagWeights(NamedTuple):
     """Share of the input's change over half a step in the output."""
 
     def after_half(self, output: Value, first: Value, last: Value) -> Value:
-        """Output after half a step in which the input goes from ``first`` to ``last``."""
+        """Output after half a step in which the input goes linearly from ``first`` to ``last``; all in one unit."""
         return first + (output - first) * self.decay + (last - first) * self.ramp
 
 
 def lag_weights(ops: Ops, time_constant_s: Value, step_s: Value) -> LagWeights:
-    """Weights for a time constant and a step [s], each a number or one per car; both may be 0."""
+    """Weights for a time constant and a step [s], each a number or one per car (cars,); both may be 0."""
     ratio = time_constant_s / (step_s + NO_STEP_S)
     span = 0.5 / ops.at_least(ratio, _MIN_RATIO)  # half a step in time constants
     decay = ops.exp(-span)

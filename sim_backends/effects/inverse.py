@@ -15,7 +15,11 @@ _MIN_PIVOT = 1e-9
 def newton_inverse(
     ops: Ops, observe: Callable[[tuple[Value, ...]], tuple[Value, ...]], measured: tuple[Value, ...]
 ) -> tuple[Value, ...]:
-    """The state that ``observe`` maps to ``measured``, searched from ``measured``."""
+    """The state that ``observe`` maps to ``measured``, by Newton's method with difference quotients.
+
+    States are x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s], each () or (cars,). The search starts at
+    ``measured`` and is done for each car by itself.
+    """
     state = measured
     for _ in range(_ITERATIONS):
         seen = observe(state)

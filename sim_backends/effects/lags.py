@@ -15,7 +15,7 @@ class FirstOrderLag(ActuatorEffect):
     parameters = (EffectParameter("time_constant", "s", 0.0, 0.0, 5.0, 0.08),)
 
     def step_numbers(self, ops: Ops, duration_s: Value, values: Parameters) -> Parameters:
-        """Weights of the closed form."""
+        """The weights of ``first_order.LagWeights`` by name [1]."""
         return lag_weights(ops, values["time_constant"], duration_s)._asdict()
 
     def step(

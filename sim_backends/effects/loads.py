@@ -41,7 +41,8 @@ class LoadTransfer(DynamicsEffect):
     ax depends on the front's side force and so on the load. That force is proportional to the load,
     ``F_front = f F_z,front``, so the loop is closed exactly: with ``k = h / L`` and ``X`` all longitudinal forces but
     that one, ``m ax = X - f (F_z,front - k m ax) sin d`` gives ``m ax = (X - f F_z,front sin d) / (1 - k f sin d)``.
-    ``f`` is that of the steady force, before relaxation and roll. With a limit of the driven axle that itself depends
+    Source of the transfer: Milliken and Milliken 1995, "Race Car Vehicle Dynamics", ch. 18. ``f`` is that of the steady
+    force, before relaxation and roll. With a limit of the driven axle that itself depends
     on the load, both are repeated twice (the loop's gain is about ``mu h / L``).
     """
 

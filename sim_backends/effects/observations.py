@@ -114,7 +114,7 @@ class MocapLatency(ObservationEffect):
     )
 
     def latency_s(self, values: Parameters) -> Value | None:
-        """Instead of the car file's."""
+        """The effect's latency replaces the car file's [s]."""
         return values["latency"]
 
 
@@ -142,5 +142,5 @@ class VelocityFilterLag(ObservationEffect):
     )
 
     def velocity_time_constant_s(self, values: Parameters) -> Value | None:
-        """Of the filter."""
+        """Time constant of the filter [s]."""
         return values["time_constant"]

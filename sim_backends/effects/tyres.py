@@ -39,8 +39,9 @@ MAX_SHARE = 0.98
 class TyreSaturation(DynamicsEffect):
     """Pacejka tyres for a car file of kind kinematic or linear_tyre: the car becomes of kind "dynamic".
 
-    ``F = -mu F_z sin(C atan(B a))`` with these numbers; each is the car file's own where it is not given. There is no
-    value that switches it off; in a car file that has Pacejka tyres already it does nothing.
+    ``F = -mu F_z sin(C atan(B a))`` (Pacejka 2012, "Tire and Vehicle Dynamics", ch. 4) with these numbers; each is
+    the car file's own where it is not given. There is no value that switches it off; in a car file that has Pacejka
+    tyres already it does nothing.
     """
 
     id = "tyre_saturation"
@@ -205,7 +206,7 @@ class TyreRelaxation(DynamicsEffect):
             setattr(forces, f"side_{name}", ops.where(lags, force, steady))
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
-        """The steady forces."""
+        """The steady side forces by name [N]."""
         return {f"{self.id}.front": forces.side_front, f"{self.id}.rear": forces.side_rear}
 
     def stiff_step(self, ops: Ops, start: StepStart, values: Parameters) -> RelaxedSides:
@@ -231,7 +232,7 @@ class RelaxedSides:
         """Forces at the latest stage; after the fourth, at the end of the step."""
 
     def at_stage(self, vx: Value, front: Value, rear: Value) -> tuple[Value, Value]:
-        """Forces at the next stage, from vx and the steady forces there."""
+        """Front and rear force [N] at the next stage, from vx [m/s] and the steady forces [N] there."""
         now = (front, rear)
         if self._weights is None or self._stage == 1:
             speed = self._ops.at_least(self._ops.abs(vx), RELAXATION_FLOOR_MPS)
@@ -251,7 +252,7 @@ class RelaxedSides:
         return self.last
 
     def finish(self) -> dict[str, Value]:
-        """The side forces at the end of the step."""
+        """The side forces at the end of the step by name [N]."""
         return dict(zip(self._names, self.last, strict=True))
 
 

@@ -190,13 +190,13 @@ class PositionScale(ObservationEffect):
     confusable = (Confusable("marker_offset"),)
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Multiply positions and velocities by the scale."""
+        """Multiply positions and velocities by ``1 + scale``."""
         x, y, yaw, vx, vy, yaw_rate = state
         stretch = 1.0 + values["scale"]
         return x * stretch, y * stretch, yaw, vx * stretch, vy * stretch, yaw_rate
 
     def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Divide positions and velocities by the scale."""
+        """Divide positions and velocities by ``1 + scale``."""
         x, y, yaw, vx, vy, yaw_rate = measured
         stretch = 1.0 + values["scale"]
         return x / stretch, y / stretch, yaw, vx / stretch, vy / stretch, yaw_rate

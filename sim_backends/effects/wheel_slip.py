@@ -88,7 +88,7 @@ class LongitudinalSlip(DynamicsEffect):
         return SlipStep(ops, start, values)
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
-        """Slip speed at which wheels and car have equal acceleration; at most 0.95 of the force limit."""
+        """Slip speed [m/s] at which wheels and car have equal acceleration; at most 0.95 of the force limit."""
         _, peak = _limits(ops, forces, values)
         wheels = ops.at_least(values["inertia"], MIN_INERTIA_KGM2) / WHEEL_RADIUS_M**2
         share = ops.clip(forces.axle_force * forces.mass / ((forces.mass + wheels) * peak), -0.95, 0.95)
@@ -147,7 +147,7 @@ def step_wheels(
         demand: Motor force on the axle at the start, less damping [N].
         damping: Decrease of the motor force per speed [N s/m].
         rest: All other forces along x, ``m vy r`` included [N].
-        step_s: Length of the step.
+        step_s: Length of the step [s].
     """
     _, peak = _limits(ops, forces, values)
     per_mass = 1.0 / forces.mass

@@ -29,8 +29,9 @@ Table = Mapping[str, FloatArray]
 class Steps:
     """M short steps of the refitted model.
 
-    ``starts`` (M, 6), ``rows`` (M,) of the recording where they begin, ``fine`` the acting commands of the whole
-    recording by substeps (N n, 2), ``parts`` the n substeps of a period [s], ``count`` rows in a step. ``ends`` (M, 6)
+    ``starts`` (M, 6), ``rows`` (M,) of the recording where they begin, ``t_s`` their times (M,) [s], ``fine`` the
+    acting commands of the whole recording by substeps (N n, 2), ``parts`` the n substeps of a period [s] (n,),
+    ``count`` rows in a step. ``ends`` (M, 6)
     is where the refitted model gets, ``changed`` where it gets with other commands.
     """
 
@@ -48,7 +49,7 @@ class Steps:
 
     @property
     def length_s(self) -> float:
-        """Length of a step."""
+        """Length of a step [s]."""
         return self.count * float(self.parts.sum())
 
     @property
@@ -87,7 +88,17 @@ class Steps:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Input of the baselines for one case."""
+    """Input of the baselines for one case.
+
+    Attributes:
+        nominal, car: nominal and refitted car.
+        fit, hold: recordings to fit and held out.
+        floor: noise floors of the six channels (6,).
+        steps, hold_steps: short steps of both recordings.
+        errors, hold_errors: residual accelerations of these steps (M, 3) [m/s2, m/s2, rad/s2].
+        windows: held-out windows.
+        refit_score: score of the refitted car on these windows.
+    """
 
     nominal: BaseCar
     car: BaseCar
@@ -108,7 +119,11 @@ class Prepared:
 
 
 def prepare(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, float]) -> Prepared:
-    """Clean the columns, refit the base model, and cut both recordings into short steps."""
+    """Clean the columns, refit the base model, and cut both recordings into short steps.
+
+    Raises:
+        DataError: too few usable rows, or stamps that do not fit the control period.
+    """
     floors = np.array([floor[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
     recordings = [clean(table, nominal, floors) for table in (fit, hold)]
     windows = [cut_windows(r, nominal).with_floor(floors) for r in recordings]
@@ -131,7 +146,16 @@ def prepare(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, float
 
 
 def clean(table: Table, car: BaseCar, floors: FloatArray) -> Recording:
-    """Resample on even rows, interpolate gaps and outliers, and re-estimate velocities at jumps of the pose."""
+    """Resample on even rows, interpolate gaps and outliers, and re-estimate velocities at jumps of the pose.
+
+    Args:
+        table: columns (N,) by name.
+        car: with the control period.
+        floors: noise floors of the six channels (6,).
+
+    Raises:
+        DataError: the stamps do not fit the control period.
+    """
     t = np.asarray(table["t"])
     even = t[0] + car.control_period * np.arange(round((t[-1] - t[0]) / car.control_period) + 1)
     if not 100 <= len(even) <= 200_000:

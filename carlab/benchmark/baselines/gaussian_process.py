@@ -19,7 +19,7 @@ TUNED_ON = 150
 
 
 def gp_score(data: Prepared) -> float:
-    """Held-out score of the refitted model with the process's mean added."""
+    """Held-out score of the refitted model with the process's mean added. Raises ConfigError without scikit-learn."""
     try:
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel

@@ -31,7 +31,13 @@ EITHER_SIGN = frozenset({
 
 @dataclass(frozen=True)
 class System:
-    """Weighted, stacked regression: y = X c; rows are steps times three channels."""
+    """Weighted, stacked regression: y = X c; the rows are M steps times three channels.
+
+    Attributes:
+        terms: the K terms by name.
+        fit_x, hold_x: X of both recordings (3 M, K).
+        fit_y, hold_y: y of both recordings (3 M,).
+    """
 
     terms: dict[str, Term]
     fit_x: FloatArray
@@ -52,11 +58,11 @@ class System:
         return cls(terms, *parts)
 
     def squares(self, coefficients: FloatArray) -> FloatArray:
-        """Squared errors on the held-out recording."""
+        """Squared errors (3 M,) on the held-out recording for coefficients (K,)."""
         return np.asarray((self.hold_y - self.hold_x @ coefficients) ** 2)
 
     def dominant(self, coefficients: FloatArray) -> str | None:
-        """The effect with the largest contribution among those whose sign is possible."""
+        """The effect with the largest contribution by coefficients (K,) among those whose sign is possible."""
         shares: dict[str, float] = {}
         for name, c, column in zip(self.terms, coefficients, self.fit_x.T, strict=True):
             effect = effect_of(name)
@@ -66,7 +72,7 @@ class System:
 
 
 def pysindy_regression(system: System) -> FloatArray:
-    """Coefficients (terms,) by PySINDy."""
+    """Coefficients (K,) by PySINDy. Raises ConfigError if it is not installed."""
     try:
         import pysindy
     except ImportError as error:
@@ -102,7 +108,7 @@ def _quietly(solver: object, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def stepwise_bic(system: System) -> FloatArray:
-    """Coefficients (terms,) by forward selection; the steps overlap, so a third of the rows count as independent."""
+    """Coefficients (K,) by forward selection; the steps overlap, so a third of the rows count as independent."""
     x, y = system.fit_x, system.fit_y
     names = list(system.terms)
     gram, moment, total = x.T @ x, x.T @ y, float(y @ y)
@@ -134,7 +140,7 @@ def stepwise_bic(system: System) -> FloatArray:
 
 
 def corrected_score(data: Prepared, system: System, coefficients: FloatArray) -> float:
-    """Held-out score with the terms added to the refitted model."""
+    """Held-out score with the terms, times coefficients (K,), added to the refitted model."""
     active = [(name, c) for name, c in zip(system.terms, coefficients, strict=True) if c != 0.0]
 
     def added(steps: Steps, which: list[tuple[str, float]]) -> FloatArray:

@@ -25,7 +25,16 @@ CommandChange = Callable[[FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Windows:
-    """Initial states (M, 6), mean commands of substeps (M, S, 2), recorded final states (M, 6), floor errors (M, 6)."""
+    """M windows of S substeps.
+
+    Attributes:
+        car: propagates errors of the initial states.
+        steps_s: lengths of the substeps (S,) [s].
+        starts: initial states (M, 6).
+        commands: mean commands of the substeps (M, S, 2).
+        recorded: final states (M, 6).
+        floor_errors: errors of the true car (M, 6), whose root mean square is the noise floor.
+    """
 
     car: BaseCar
     steps_s: FloatArray
@@ -36,7 +45,7 @@ class Windows:
 
     @property
     def floor(self) -> FloatArray:
-        """Noise floor of the six channels."""
+        """Noise floor of the six channels (6,)."""
         return np.asarray(np.sqrt((self.floor_errors**2).mean(axis=0)), dtype=np.float64)
 
     def with_floor(self, floor: FloatArray) -> Windows:
@@ -137,7 +146,7 @@ def channel_scores(windows: Windows, values: Mapping[str, float], floor: FloatAr
 
 
 def score(windows: Windows, values: Mapping[str, float], floor: FloatArray | None = None) -> float:
-    """Root mean square over windows and channels of the error after the horizon, in noise floors."""
+    """Root mean square over windows and channels of the error after the horizon, in noise floors (6,)."""
     return float(np.sqrt((channel_scores(windows, values, floor) ** 2).mean()))
 
 

@@ -70,7 +70,7 @@ class CatalogueInfluence:
         return self._projected(self._blocks(dynamic + self._observed(world)))
 
     def closest(self, influence: FloatArray) -> Resemblance:
-        """The effect of the catalogue that explains most of an influence from ``of``."""
+        """The effect of the catalogue that explains most of an influence (3 K,) from ``of``."""
         total = float(influence @ influence)
         shares = {name: float(((q.T @ influence) ** 2).sum()) / total for name, q in self._effects.items()}
         name = max(shares, key=lambda effect: shares[effect])

@@ -97,7 +97,11 @@ class Scene:
         return fitted, tuple(recordings), windows[1]
 
     def sized(self, form: Form, target: float, tries: int = 8) -> tuple[Concealed, float]:
-        """Scale the effect until its excess is ``target``, or as near as possible. Returns it and its excess."""
+        """Scale the effect until its excess is ``target``, or as near as possible. Returns it and its excess.
+
+        Raises:
+            DataError: the car cannot be driven with any size, or every draw resembles the catalogue.
+        """
         draw, resemblance = self._draw(form)
         low, high, best, best_miss, best_excess = 0.0, math.inf, None, math.inf, 0.0
         size, last = min(max(form.typical * target, form.smallest), form.largest), (0.0, 0.0)

@@ -107,9 +107,9 @@ def indistinguishable(
         one: An effect's id.
         other: Another effect's id.
         nominal: The nominal car.
-        fit: Columns of the recording to fit, evenly spaced.
+        fit: Columns (N,) of the recording to fit, evenly spaced.
         hold: Columns of the held-out recording.
-        floor: Noise floors of the six channels.
+        floor: Noise floors of the six channels (6,).
 
     Returns:
         None if one of the effects is not in CHEAP.

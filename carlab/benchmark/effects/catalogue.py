@@ -84,7 +84,7 @@ class Draw:
     def from_rng(
         cls, rng: np.random.Generator, car: BaseCar, places: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
     ) -> Draw:
-        """Sign, three shares in [0, 1] and a place on the track."""
+        """Draw sign, three shares in [0, 1] and one of the places (N, 2) [m] on the track."""
         place = places[int(rng.integers(len(places)))]
         shares = rng.random(3)
         return cls(

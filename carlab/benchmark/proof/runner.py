@@ -73,7 +73,11 @@ class Proof(SealedRun):
         self.command = tuple(command)
 
     def make(self) -> str | None:
-        """Make the missing cases, then seal. Returns the hash of the seal, or None if stopped."""
+        """Make the missing cases, then seal. Returns the hash of the seal, or None if stopped.
+
+        Raises:
+            DataError: a case cannot be made.
+        """
         specs = dict(zip(self.names(), self.specs, strict=True))
 
         def make_one(name: str) -> ChildEnd:
@@ -113,7 +117,7 @@ class Proof(SealedRun):
     def baselines(self) -> bool:
         """Run the baselines on cases of the kinds COMPARED, with the same files and the true noise floor.
 
-        Returns whether all are done. Raises DataError before the answers are sealed.
+        Returns whether all are done. Raises DataError before the answers are sealed, or if a baseline fails.
         """
         self.need_seal()
         folder = self.root / "baselines"

@@ -179,7 +179,7 @@ def write_scores(
 
 
 def confusion(rows: Iterable[Row]) -> tuple[list[str], list[str], np.ndarray[tuple[int, ...], np.dtype[np.int64]]]:
-    """Return concealed effects (rows), first named effects or verdicts (columns), and counts."""
+    """Return R concealed effects, C first named effects or verdicts, and counts (R, C)."""
     pairs = []
     for r in rows:
         if r["kind"] in ("pair", "multiple"):

@@ -116,7 +116,7 @@ class PublicCar:
         return np.array(init(core, self.p), dtype=np.float64)
 
     def rates(self, state: FloatArray, inputs: Sequence[float]) -> list[float]:
-        """The package's right-hand side; inputs are the requested steering rate [rad/s] and acceleration [m/s^2].
+        """Rates of a state (n,) by the package; inputs are the requested steering rate [rad/s] and acceleration [m/s2].
 
         The package changes a negative wheel speed in the state of its caller, and sets its rate to 0. An integrator
         does not see this change, so a wheel with a slightly negative speed would stay locked. Therefore negative wheel
@@ -154,7 +154,7 @@ class RollingDriver(HumanDriver):
     """
 
     def __call__(self, t: float, state: FloatArray) -> tuple[float, float]:
-        """Commands for the tick at t [s]."""
+        """Steering and throttle in [-1, 1] for the tick at t [s]; the state (6,) is that of the newest capture."""
         steering, throttle = super().__call__(t, state)
         speed = math.hypot(state[3], state[4])
         max_steering = math.atan(self._car.wheelbase * self._grip / max(speed, 0.3) ** 2) / self._car.max_angle

@@ -2,7 +2,7 @@
 
 A command column u becomes u' such that the effect maps u' to u: a model with the effect, driven by u', receives what
 the real car received. Observation columns are computed as an additional sensor error would have changed them.
-Commands are shares of full command; row k holds from its stamp to the next one.
+Commands (N,) are shares of full command; row k holds from its stamp to the next one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OBSERVED = ("x", "y", "yaw", "vx", "vy", "yaw_rate")
 
 
 def issued_earlier(command: FloatArray, rows: int) -> FloatArray:
-    """The command appears to act ``rows`` rows later; the last rows repeat the last command."""
+    """Command (N,) that appears to act ``rows`` rows later; the last rows repeat the last command."""
     return np.concatenate([command[rows:], np.full(rows, command[-1])])
 
 
@@ -46,12 +46,12 @@ def before_lag(t_s: FloatArray, command: FloatArray, time_constant_s: float) -> 
 
 
 def before_dead_band(command: FloatArray, half_width: float) -> FloatArray:
-    """Command before a dead band that subtracts ``half_width``; commands of zero stay zero."""
+    """Command (N,) before a dead band that subtracts ``half_width``; commands of zero stay zero."""
     return command + half_width * np.clip(command / ZERO_COMMAND, -1.0, 1.0)
 
 
 def before_play(command: FloatArray, play: float) -> FloatArray:
-    """Command before a play operator of total width ``play``: half of it ahead in the direction of motion."""
+    """Command (N,) before a play operator of total width ``play``: half of it ahead in the direction of motion."""
     step = np.sign(np.diff(command, prepend=command[0]))
     moving = np.flatnonzero(step)
     if not moving.size:
@@ -62,7 +62,7 @@ def before_play(command: FloatArray, play: float) -> FloatArray:
 
 
 def before_saturation(command: FloatArray, saturation: float) -> FloatArray:
-    """Command before ``saturation * tanh(u / saturation)``."""
+    """Command (N,) before ``saturation * tanh(u / saturation)``."""
     return saturation * np.arctanh(command / saturation)
 
 
@@ -80,7 +80,7 @@ def moved_point(table: Table, ahead_m: float, left_m: float) -> Table:
 
 
 def yaw_rate_without_spikes(table: Table) -> FloatArray:
-    """The column, with the slope of the yaw over five rows where the column is far from it."""
+    """The column (N,) [rad/s], with the slope of the yaw over five rows where the column is far from it."""
     yaw, period_s = np.unwrap(table["yaw"]), float(np.median(np.diff(table["t"])))
     slope = local_fit(yaw[:, None], 5, 2, period_s)[1][:, 0]
     return np.where(np.abs(table["yaw_rate"] - slope) > SPIKE_RADPS, slope, table["yaw_rate"])
@@ -115,5 +115,5 @@ def filtered_velocity(table: Table, time_constant_s: float) -> Table:
 
 
 def with_command(table: Table, name: str, change: Callable[[FloatArray], FloatArray]) -> Table:
-    """The table with a changed command column."""
+    """The table with a changed command column; ``change`` maps (N,) to (N,)."""
     return {**table, name: change(table[name])}

@@ -121,7 +121,11 @@ class RealProof(SealedRun):
         return self.seal()
 
     def diagnose_references(self) -> bool:
-        """Diagnose the references that cases need; returns whether all are done."""
+        """Diagnose the references that cases need; returns whether all are done.
+
+        Raises:
+            DataError: before the answers are sealed, or if a diagnosis fails.
+        """
         self.need_seal()
         needed = sorted({str(self._answer(name)["reference"]) for name in self.case_names()})
         folder = self.root / "references"

@@ -33,7 +33,11 @@ FREE = {
 
 @dataclass(frozen=True)
 class BaseCar:
-    """Parameters of the single-track model, SI units; B and C are Pacejka's stiffness and shape factor."""
+    """Parameters of the single-track model; B and C are Pacejka's stiffness and shape factor [1].
+
+    Units: mass [kg], yaw_inertia [kg m2], axles [m] from the centre of mass, drive_gain [N], damping [N s/m], max_angle
+    [rad], control_period, command_delay and latency [s], mocap_rate [Hz], position_std [m], yaw_std [rad].
+    """
 
     mass: float = 1.65
     yaw_inertia: float = 0.06

@@ -60,7 +60,7 @@ class HumanDriver:
         return (float(self._track.points[i, 0]), float(self._track.points[i, 1]), float(heading), 0.0, 0.0, 0.0)
 
     def __call__(self, t: float, state: FloatArray) -> tuple[float, float]:
-        """Commands for the tick at t [s]."""
+        """Steering and throttle in [-1, 1] for the tick at t [s]; the state (6,) is that of the newest capture."""
         period = self._car.control_period
         x, y, psi, vx = (float(v) for v in state[:4])
         i = self._track.nearest(x, y)

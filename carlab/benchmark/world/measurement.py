@@ -18,8 +18,8 @@ COLUMNS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
 class Recording:
     """A recording and its noise-free counterpart.
 
-    t_s (N,), measured (N, 6) as x, y, yaw (unwrapped), vx, vy, yaw_rate; commands (N, 2); error (N, 6) what noise and
-    differentiation add to the noise-free measurement.
+    t_s (N,), measured (N, 6) as x, y [m], yaw (unwrapped) [rad], vx, vy [m/s], yaw_rate [rad/s]; commands (N, 2);
+    error (N, 6) what noise and differentiation add to the noise-free measurement.
     """
 
     t_s: FloatArray
@@ -97,17 +97,17 @@ def to_body(yaw: FloatArray, slope: FloatArray) -> FloatArray:
 
 
 def body_velocity(pose: FloatArray, gap_s: float, window: int) -> FloatArray:
-    """Body velocities by differentiating the pose, each row with the measured yaw."""
+    """Body velocities (N, 3) by differentiating the pose (N, 3), each row with the measured yaw."""
     return to_body(pose[:, 2], local_fit(pose, window, 2, gap_s)[1])
 
 
 def wrapped(yaw: FloatArray) -> FloatArray:
-    """Wrap to (-pi, pi]."""
+    """Wrap angles (...) to (-pi, pi]."""
     return -np.remainder(-yaw + np.pi, 2 * np.pi) + np.pi
 
 
 def as_table(recording: Recording) -> dict[str, FloatArray]:
-    """Columns of a recording by name."""
+    """Columns (N,) of a recording by name."""
     columns = [recording.t_s, *recording.measured.T, *recording.commands.T]
     table = dict(zip(COLUMNS, columns, strict=True))
     table["yaw"] = wrapped(table["yaw"])
@@ -115,7 +115,7 @@ def as_table(recording: Recording) -> dict[str, FloatArray]:
 
 
 def write_csv(path: Path, table: dict[str, FloatArray]) -> None:
-    """Write columns of equal length; empty fields where a value is missing (NaN)."""
+    """Write columns (N,); empty fields where a value is missing (NaN)."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(table)
@@ -124,7 +124,7 @@ def write_csv(path: Path, table: dict[str, FloatArray]) -> None:
 
 
 def read_csv(path: Path) -> dict[str, FloatArray]:
-    """Read a file of write_csv."""
+    """Read the columns (N,) of a file of write_csv."""
     with path.open() as file:
         names = file.readline().strip().split(",")
     return dict(zip(names, np.genfromtxt(path, delimiter=",", skip_header=1, dtype=np.float64).T, strict=True))

@@ -26,11 +26,13 @@ HIDDEN_STEP_S = 1e-3
 class Drive:
     """A noise-free drive.
 
-    row_s     (N,)       times of the control ticks, 0 the first
+    row_s     (N,)       times of the control ticks [s], 0 the first
     commands  (N, 2)     steering and throttle as issued at the ticks
-    capture_s (N s - s + 1,)   capture times; row k was captured at index k s
+    capture_s (N s - s + 1,)   capture times [s]; row k was captured at index k s
     captures  (N s - s + 1, 6) true state there
     per_row   s, captures a row
+    switch_s  (W,)       times at which an acting command changes [s]
+    switch_values (W, 2) wheel angle [rad] and throttle that act from then on
     """
 
     row_s: FloatArray

@@ -105,7 +105,9 @@ def train(
         Figures, which are also written to ``training.json`` of the result.
 
     Raises:
-        DataError: the recordings hold no row, or model or policy diverged. No partial result remains.
+        DataError: a recording or the previous training cannot be read, the method needs more rows, or the result
+            cannot be written.
+        DivergedError: model or policy diverged twice.
     """
     import torch
 

@@ -98,7 +98,12 @@ class ClusterTrainer:
         progress: Progress,
         stop: Callable[[], bool] = lambda: False,
     ) -> dict[str, Any] | None:
-        """Train on the cluster, or on this computer if the cluster does not answer; as ``train_in_subprocess``."""
+        """Train on the cluster, or on this computer if the cluster does not answer; as ``train_in_subprocess``.
+
+        Raises:
+            ConfigError: the task is an object of a Python program, which cannot be sent as data.
+            DataError: the training failed, or its files cannot be read or written.
+        """
         order = TrainingOrder(plan, models, tuple(recordings), envelope)
         arrived = order.folder.with_name(f"{order.folder.name}.partial")
         shutil.rmtree(arrived, ignore_errors=True)

@@ -57,7 +57,11 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Put the car at a start pose drawn by the task. A seed also seeds the car's sensors."""
+        """Put the car at a start pose drawn by the task; returns features (7 + 2 H,). A seed also seeds the sensors.
+
+        Raises:
+            ConfigError: the car is not simulated.
+        """
         super().reset(seed=seed)
         if self._car is None or seed is not None:
             self.close()
@@ -80,7 +84,11 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._output(), self._info(is_last=False)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Send the clipped action and wait one period."""
+        """Send the clipped action (2,) and wait one period.
+
+        Returns:
+            Features (7 + 2 H,), reward, ``terminated``, ``truncated`` and the dictionary of information.
+        """
         if self._car is None or self._pacer is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         before = self._features

@@ -153,7 +153,7 @@ class KeyboardSource:
     _held: set[int] = field(default_factory=set)
 
     def open(self) -> None:
-        """Open the window that receives the keys."""
+        """Open the window that receives the keys. Raises NotReadyError without a desktop."""
         self._pygame = _pygame(window=True)
         try:
             self._pygame.display.init()

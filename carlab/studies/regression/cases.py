@@ -225,11 +225,14 @@ class BodyFrame:
         return in_body_frame(drawn, drawn[:, :7])[0]
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """Parameters from standard normal numbers, by the model."""
+        """Parameters (P, 7) for standard normal draws (P, 7), by the model."""
         return self.model.parameters(normal)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes of the state; the car heads along x, so that world and body frame agree."""
+        """Changes of the state (P, N, 7) at inputs (N, 9) for parameters (P, 7).
+
+        The car heads along x, so that world and body frame agree.
+        """
         return self.model(inputs, parameters)
 
 

@@ -145,7 +145,12 @@ class FitTask:
         )  # fmt: skip
 
     def distilled(self, simulator: DomainModel | None, outputs: Tensor, size: Size) -> SmoothedParticles:
-        """Particles distilled from the posterior over functions at the rows; arguments as for ``posterior``."""
+        """Particles distilled from the posterior over functions at the rows, with outputs (n, O); as ``posterior``.
+
+        Raises:
+            DataError: numbers are missing or infinite, or the simulator gives no finite outputs.
+            DivergedError: the particles diverged.
+        """
         generator = torch.Generator().manual_seed(30_000 + self.seed)
         posterior = self.posterior(simulator, self.data.inputs, outputs, size)
         settings = DistillationSettings(hidden=HIDDEN, steps=self.steps or STEPS, seed=self.seed)
