@@ -85,9 +85,9 @@ def check_shapes(
     Raises:
         DataError: A wrong shape.
     """
-    cars = int(start.shape[0])
     if start.ndim != 2 or start.shape[1] != 6:
         raise DataError(f"start has shape {tuple(start.shape)}; it must be (cars, 6).")
+    cars = len(start)
     for name, sequence in (("commands", commands), ("history", history)):
         if sequence is not None and (sequence.ndim != 3 or sequence.shape[0] != cars or sequence.shape[2] != 2):
             raise DataError(f"{name} has shape {tuple(sequence.shape)}; it must be ({cars}, ticks, 2).")

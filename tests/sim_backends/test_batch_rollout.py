@@ -326,6 +326,8 @@ def test_invalid_input_is_refused():
     start, commands = some(3, 5)
     with pytest.raises(DataError, match="must be \\(cars, 6\\)"):
         rollout(SimulatorConfig(), start[:, :5], commands)
+    with pytest.raises(DataError, match="start has shape"):
+        rollout(SimulatorConfig(), torch.zeros(()), torch.zeros((1, 2, 2)))
     with pytest.raises(DataError, match="commands has shape"):
         rollout(SimulatorConfig(), start, commands[:2])
     with pytest.raises(DataError, match="must be \\(\\) or \\(3,\\)"):
