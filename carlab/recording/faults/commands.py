@@ -186,7 +186,7 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
     smooth = held_means(t_s, command, motion.t_s - 0.5 * motion.period_s, motion.period_s)
     for span_s in motion.spans_s[: 1 + COMMAND_CHANNELS.index(channel)]:
         smooth = _slope_average(smooth, round(span_s / motion.period_s))
-    explained = np.full(len(LAGS_S), -np.inf)
+    explained = np.zeros(len(LAGS_S))
     best_share, time_constant, lag, coefficients = -np.inf, 0.0, 0, np.zeros(0)
     for time_constant_s in TIME_CONSTANTS_S:
         shares, solved = regression.fit(first_order_lag(smooth, motion.period_s, time_constant_s))
