@@ -1,5 +1,6 @@
 """Several episodes in a row: the car stands still before each one, each episode ends once, none follows a stop."""
 
+import gc
 import signal
 import threading
 import time
@@ -207,3 +208,20 @@ def test_car_with_unknown_speed_does_not_count_as_still() -> None:
 
     with UnknownSpeedCar() as car:
         assert not wait_until_still(car, timeout_s=0.2)
+
+
+def test_objects_from_before_the_episode_are_not_visited_by_the_garbage_collector(tmp_path: Path) -> None:
+    """A full collection stops the control loop for as long as it visits objects."""
+    frozen: list[int] = []
+
+    class Watching(Forward):
+        def act(self, view: PolicyInput) -> Action | None:
+            frozen.append(gc.get_freeze_count())
+            return super().act(view)
+
+    earlier = [[k] for k in range(100_000)]
+    with SimulatedCar() as car:
+        make_session(car, Watching(), tmp_path, max_ticks=5).drive(1)
+    assert frozen
+    assert min(frozen) >= len(earlier)
+    assert gc.get_freeze_count() == 0
