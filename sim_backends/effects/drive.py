@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 MAX_FORCE_N = 1e9
@@ -57,12 +57,19 @@ class BrakeAsymmetry(DynamicsEffect):
         forces.drive = ops.where(braking, forces.drive * values["gain_ratio"], forces.drive)
 
 
-class MotorSaturation(DynamicsEffect):
-    """``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for the size a of the drive force, with b = ``force``.
+def limited_force(ops: Ops, force: Value, limit: Value, roundness: Value) -> Value:
+    """Limit a force (cars,) [N]: ``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for its size a, with limit b.
 
     This is the smaller root m of ``(1 - roundness) m^2 - (a + b) m + a b = 0``, a non-rectangular hyperbola: for small
-    forces a, for large ones b, and without roundness the smaller of both. It acts before damping.
+    forces a, for large ones b, and without roundness the smaller of both.
     """
+    size = ops.abs(force)
+    root = ops.sqrt((size - limit) * (size - limit) + 4.0 * roundness * size * limit + TINY)
+    return 2.0 * force * limit / (size + limit + root)
+
+
+class MotorSaturation(DynamicsEffect):
+    """The drive force is limited to ``force``, with ``roundness`` (``limited_force``). It acts before damping."""
 
     id = "motor_saturation"
     represented_by = "drive_map"
@@ -87,15 +94,14 @@ class MotorSaturation(DynamicsEffect):
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Limit the force."""
         limit = ops.where(values["force"] < MAX_FORCE_N, values["force"], MAX_FORCE_N)
-        size = ops.abs(forces.drive)
-        root = ops.sqrt((size - limit) * (size - limit) + 4.0 * values["roundness"] * size * limit + TINY)
-        forces.drive = 2.0 * forces.drive * limit / (size + limit + root)
+        forces.drive = limited_force(ops, forces.drive, limit, values["roundness"])
 
 
 class TractionLimit(DynamicsEffect):
     """``|F_x at the driven axle| <= share mu F_z`` of the rear axle, or of both where ``axle`` is "all".
 
-    F_x is the base model's, drive less damping; resistances act on the body and do not count.
+    With ``roundness`` the limit is approached gradually (``limited_force``). F_x is the base model's, drive less
+    damping; resistances act on the body and do not count.
     """
 
     id = "traction_limit"
@@ -103,12 +109,16 @@ class TractionLimit(DynamicsEffect):
     command = "throttle"
     name = "a limit of traction"
     summary = "The force of the driven wheels is limited by their grip."
-    sentence = "the force of the driven wheels ({axle:choice rear|all}) is limited to {share} times their full grip"
+    sentence = (
+        "the force of the driven wheels ({axle:choice rear|all}) is limited to {share} times their full grip, with "
+        "roundness {roundness} (0: a sharp limit)"
+    )
     refuted_if = "the same limit is reached on a floor with more grip (then it is the motor's)"
     order = 40
     parameters = (
         EffectParameter("share", "1", math.inf, 0.0, math.inf, 0.7),
         EffectParameter("axle", "1", 0.0, 0.0, 1.0, 0.0, choices=("rear", "all")),
+        EffectParameter("roundness", "1", 0.0, 0.0, 1.0, 0.3),
     )
     confusable = (
         Confusable(
@@ -124,4 +134,5 @@ class TractionLimit(DynamicsEffect):
         grip = ops.where(values["axle"] < 0.5, rear, rear + forces.grip_front * forces.load_front)
         limited = values["share"] < MAX_SHARE
         limit = ops.where(limited, values["share"], 1.0) * grip
-        forces.axle_force = ops.where(limited, ops.clip(forces.axle_force, -limit, limit), forces.axle_force)
+        rounded = limited_force(ops, forces.axle_force, limit, values["roundness"])
+        forces.axle_force = ops.where(limited, rounded, forces.axle_force)

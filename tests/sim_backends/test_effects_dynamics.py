@@ -67,6 +67,10 @@ CASES = {
     },
     "transfer_with_downforce": {"load_transfer": {"height": 0.1}, "aerodynamic_downforce": {"coefficient": 0.5}},
     "traction_with_transfer": {"traction_limit": {"share": 0.6}, "load_transfer": {"height": 0.06}},
+    "round_traction_with_transfer": {
+        "traction_limit": {"share": 0.7, "roundness": 0.4},
+        "load_transfer": {"height": 0.06},
+    },
 }
 
 
@@ -74,6 +78,11 @@ THROTTLES = (-1, -0.6, -0.35, -0.2, -0.1, -0.04, 0, 0.04, 0.1, 0.2, 0.35, 0.6, 1
 SPEEDS = (-4.5, -3, -2, -1, -0.5, 0, 0.5, 1, 2, 3, 4.5)
 SLIPS = (0, 0.04, 0.1, 0.2, 0.4, 0.8)
 ACCELERATIONS = {"front_tyre_map": (-6, -3, 0, 3, 6), "rear_tyre_map": (-8, -5, -2.5, 0, 2.5, 5, 8)}
+
+
+def smaller_root(shape: float, force: float, limit: float) -> float:
+    """The smaller root of ``shape m^2 - (force + limit) m + force limit = 0``."""
+    return float(np.roots([shape, -(force + limit), force * limit]).real.min())
 
 
 def drive_map_at(e, throttle, speed):
@@ -118,7 +127,7 @@ def reference_rates(t, s, d, u, p, e):
         drive += m * drive_map_at(e, u, vx)
     if has("motor_saturation"):
         limit, shape = e["motor_saturation"]["force"], 1 - e["motor_saturation"].get("roundness", 0)
-        drive = math.copysign(np.roots([shape, -(abs(drive) + limit), abs(drive) * limit]).real.min(), drive)
+        drive = math.copysign(smaller_root(shape, abs(drive), limit), drive)
     if has("drive_change"):
         drive *= 1 + e["drive_change"]["share"]
     demand = drive - p.damping_nspm * vx
@@ -172,7 +181,8 @@ def reference_rates(t, s, d, u, p, e):
             grip = mu_rear * (z_rear + transferred_load) + (
                 mu_front * (z_front - transferred_load) if q.get("axle") == "all" else 0.0
             )
-            force = min(max(demand, -q["share"] * grip), q["share"] * grip)
+            limit, shape = q["share"] * grip, 1.0 - q.get("roundness", 0.0)
+            force = math.copysign(smaller_root(shape, abs(demand), limit), demand)
         m_ax = force + body_x - front_each * (z_front - transferred_load) * math.sin(d)
         transferred_load = m_ax * height / (a + b)
     z_front, z_rear = z_front - transferred_load, z_rear + transferred_load

@@ -75,6 +75,14 @@ def test_round_saturation_is_the_harmonic_limit_at_roundness_one():
     assert state.vx_mps == pytest.approx(-0.5 * P.drive_gain_n / P.mass_kg, rel=1e-9)
 
 
+def test_round_limit_of_traction_is_the_harmonic_limit_at_roundness_one():
+    full = 0.8 * P.rear_mu * P.mass_kg * G * 0.13 / 0.3
+    effects = {"traction_limit": {"share": 0.8, "roundness": 1.0}}
+    state = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, 1.0)).state
+    force = 1.0 / (1.0 / P.drive_gain_n + 1.0 / full)
+    assert state.vx_mps == pytest.approx(force / P.mass_kg, rel=1e-9)
+
+
 def test_brake_gain_applies_while_braking_only():
     cfg = config({"brake_asymmetry": {"gain_ratio": 2.0}}, motor__damping=0.0)
     assert drive(cfg, (0, 0, 0, 3.0, 0, 0), (0.0, -0.2), 0.5).state.vx_mps == pytest.approx(
