@@ -69,7 +69,10 @@ def limited_force(ops: Ops, force: Value, limit: Value, roundness: Value) -> Val
 
 
 class MotorSaturation(DynamicsEffect):
-    """The drive force is limited to ``force``, with ``roundness`` (``limited_force``). It acts before damping."""
+    """``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for the size a of the drive force, with b = ``force``.
+
+    For small forces a, for large ones b, and without roundness the smaller of both. It acts before damping.
+    """
 
     id = "motor_saturation"
     represented_by = "drive_map"
@@ -98,10 +101,11 @@ class MotorSaturation(DynamicsEffect):
 
 
 class TractionLimit(DynamicsEffect):
-    """``|F_x at the driven axle| <= share mu F_z`` of the rear axle, or of both where ``axle`` is "all".
+    """``|F_x at the driven axle| <= b`` with ``b = share mu F_z`` of the rear axle, or of both where ``axle`` is "all".
 
-    With ``roundness`` the limit is approached gradually (``limited_force``). F_x is the base model's, drive less
-    damping; resistances act on the body and do not count.
+    With ``roundness`` the size is ``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` instead of the smaller of a
+    and b, where a is the size without limit. F_x is the base model's, drive less damping; resistances act on the body
+    and do not count.
     """
 
     id = "traction_limit"
