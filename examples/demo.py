@@ -1,7 +1,7 @@
 """Complete example: a car that differs from its car file learns to park, and a diagnosis identifies the differences.
 
 The servo of the emulated car lags by 70 ms, and its motor is weaker than in the car file. carlab reads only the car
-file and the measurements of the emulated hardware. Takes five minutes on two idle cores, or one or two with
+file and the measurements of the emulated hardware. Takes five to seven minutes on two idle cores, or one or two with
 ``--car sim --updates 300``.
 """
 
