@@ -18,7 +18,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.compiled.code_store import object_code
+from sim_backends.compiled.code_cache import cached_object_code
 from sim_backends.compiled.tracing import Node, needed_nodes
 from sim_backends.compiled.vector_math import Name, VectorWriter
 
@@ -239,14 +239,14 @@ def _compile(writer: VectorWriter, rest: Sequence[str]) -> MachineCode:
 
 
 def _linked(source: str) -> MachineCode:
-    """The function of LLVM code, from its stored object code or compiled."""
+    """The function of LLVM code, compiled or from the cache."""
     compiler = _compiler()
 
     def compiled() -> bytes:
         code: bytes = compiler.machine.emit_object(llvm.parse_assembly(source))
         return code
 
-    code = object_code((compiler.name, source), compiled)
+    code = cached_object_code((compiler.name, source), compiled)
     builder = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(_NAME)
     library = builder.link(compiler.linker, f"library_{next(_IDS)}")
     return MachineCode(_FUNCTION(library[_NAME]), library)

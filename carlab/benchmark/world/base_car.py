@@ -33,7 +33,7 @@ FREE = {
 
 @dataclass(frozen=True)
 class BaseCar:
-    """Parameters of the single-track model; B and C are Pacejka's stiffness and shape factor [1].
+    """Parameters of the single-track model; B [1/rad] and C [1] are Pacejka's stiffness and shape factor.
 
     Units: mass [kg], yaw_inertia [kg m2], axles [m] from the centre of mass, drive_gain [N], damping [N s/m], max_angle
     [rad], control_period, command_delay and latency [s], mocap_rate [Hz], position_std [m], yaw_std [rad].

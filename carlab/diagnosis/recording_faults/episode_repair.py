@@ -25,7 +25,7 @@ class EpisodeRepair:
         episode: the recording before repair.
         times_s: stamps (N,).
         states: states (N, 6): x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
-        commands: sent commands (N, 2), steering and throttle; that of the last row is never executed.
+        commands: sent commands (N, 2), steering and throttle; that of the last row is not executed.
         segment: number of the unbroken stretch (N,).
         rows: indices (N,) of the remaining rows in the recording.
         interpolated: whether the pose of a row was interpolated (N,).

@@ -34,7 +34,7 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
     """Find empty, non-finite or too large cells. Returns findings and the mask of complete rows (N,).
 
     ``values`` are the columns (N,) by channel.
-    Commands of the last row are never executed, so they may be missing.
+    Commands of the last row are not executed, so they may be missing.
     """
     rows = len(values["t"])
     whole = np.ones(rows, dtype=bool)

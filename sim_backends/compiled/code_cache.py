@@ -1,7 +1,7 @@
-"""Machine code kept between runs, in the user's own cache folder.
+"""Disk cache of compiled machine code, in the user's own cache folder.
 
 Compiling takes a fifth of a short diagnosis. A file holds the object code of one function; its name is the hash of
-everything that the code depends on. Nothing is ever read from a recording, car file or run folder.
+everything that the code depends on. The cache is not read from recordings, car files or run folders.
 """
 
 from __future__ import annotations
@@ -21,37 +21,36 @@ _SUFFIX = ".object"
 _HASH_BYTES = 32
 
 
-def folder() -> Path:
+def cache_folder() -> Path:
     """The folder of the files."""
     return platformdirs.user_cache_path("carlab", appauthor=False) / "machine-code"
 
 
-def object_code(depends_on: tuple[str, ...], compiled: Callable[[], bytes]) -> bytes:
-    """The object code from its file, or from ``compiled``, which is then written to the file.
+def cached_object_code(key: tuple[str, ...], compile_code: Callable[[], bytes]) -> bytes:
+    """Object code from the cache, or compiled and written to the cache.
 
-    A file that is damaged is replaced. A folder that cannot be read or written, or that other users can write to, is
-    not used.
+    A damaged file is replaced. A folder that cannot be read or written, or that other users can write to, is not used.
 
     Args:
-        depends_on: everything that the code depends on: source, processor, version of the compiler.
-        compiled: compiles it.
+        key: everything that the code depends on: source, processor, version of the compiler.
+        compile_code: returns the object code.
     """
-    place = folder()
-    if not _is_own(place):
-        return compiled()
-    path = place / (_hash("\0".join(depends_on).encode()).hex() + _SUFFIX)
+    folder = cache_folder()
+    if not _is_private(folder):
+        return compile_code()
+    path = folder / (_hash("\0".join(key).encode()).hex() + _SUFFIX)
     code = _read(path)
     if code is None:
-        code = compiled()
+        code = compile_code()
         with contextlib.suppress(OSError):
             _write(path, code)
     return code
 
 
-def _is_own(place: Path) -> bool:
-    """Whether no other user can write to a folder; a folder that does not exist yet is created by this one."""
+def _is_private(folder: Path) -> bool:
+    """Whether no other user can write to a folder; a missing folder is created for this user alone."""
     try:
-        status = place.stat()
+        status = folder.stat()
     except OSError:
         return True
     return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
@@ -72,24 +71,24 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, code: bytes) -> None:
-    """Write a file at once, so that another process never reads a part of it."""
+    """Write a file atomically."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     _remove_older_half(path.parent)
-    handle, unfinished = tempfile.mkstemp(dir=path.parent)
+    handle, temporary = tempfile.mkstemp(dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(_hash(code) + code)
-        os.replace(unfinished, path)
+        os.replace(temporary, path)
     except OSError:
-        Path(unfinished).unlink(missing_ok=True)
+        Path(temporary).unlink(missing_ok=True)
         raise
 
 
-def _remove_older_half(place: Path) -> None:
-    files = list(place.glob(f"*{_SUFFIX}"))
+def _remove_older_half(folder: Path) -> None:
+    files = list(folder.glob(f"*{_SUFFIX}"))
     if len(files) >= MAX_FILES:
         for path in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) // 2]:
             path.unlink(missing_ok=True)
 
 
-__all__ = ["MAX_FILES", "folder", "object_code"]
+__all__ = ["MAX_FILES", "cache_folder", "cached_object_code"]
