@@ -47,7 +47,7 @@ class EffectHooks:
         self.states = tuple(f"{e.id}.{name}" for e in dynamics for name in e.states)
 
     def base_model(self, kind: ModelKind, tyre: Mapping[str, Value]) -> tuple[ModelKind, Mapping[str, Value]]:
-        """Kind of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...) [1], as changed by the effects."""
+        """Kind of the base model and its tyre parameters (``front.mu`` ...), as changed by the effects."""
         for effect in self._effects:
             kind, tyre = effect.base_model(kind, tyre, self.values[effect.id])
         return kind, tyre

@@ -302,7 +302,7 @@ class DynamicsEffect(Effect):
     def base_model(
         self, kind: ModelKind, tyre: Mapping[str, Value], values: Parameters
     ) -> tuple[ModelKind, Mapping[str, Value]]:
-        """Change the form of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...) [1]."""
+        """Change the form of the base model and its tyre parameters (``front.mu`` [1], ``rear.B`` [1/rad] ...)."""
         return kind, tyre
 
     def required_method(self) -> str:

@@ -28,11 +28,11 @@ Z90 = 1.645
 DIFFERENCE_SHARE = 0.02
 """Step of a parameter for the derivative of a form, over its value."""
 
-TANGENT_SHARE = 1.5e-8
-"""The same within the fit: the square root of the rounding error."""
+FIT_DIFFERENCE_SHARE = 1.5e-8
+"""The same for the derivatives that the fit uses: about the square root of the rounding error."""
 
 FIT_TOLERANCE = 1e-6
-"""Relative change of the misfit at which a fit ends; a misfit decides by its size, not by its sixth digit."""
+"""Relative change of the misfit at which a fit ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ def _fitted(form: Form, knots: _Knots, settings: CurveSettings) -> _Candidate:
     best, values = knots.difference(form, np.zeros(0)) if not form.parameters else None, np.zeros(0)
     for start in itertools.product(*(p.starts for p in form.parameters)) if form.parameters else ():
         result = least_squares(
-            lambda z: knots.difference(form, z), start, jac=lambda z: _tangent(form, knots, z, high),
+            lambda z: knots.difference(form, z), start, jac=lambda z: _fit_jacobian(form, knots, z, high),
             bounds=(low, high), x_scale=np.abs(start) + 1e-3, ftol=FIT_TOLERANCE,
         )  # fmt: skip
         if best is None or result.cost < 0.5 * float(best @ best):
@@ -153,9 +153,9 @@ def _fitted(form: Form, knots: _Knots, settings: CurveSettings) -> _Candidate:
     return _Candidate(form, values, gain @ knots.correlation @ gain.T, float(best @ best), limit, rms)
 
 
-def _tangent(form: Form, knots: _Knots, values: FloatArray, high: FloatArray) -> FloatArray:
+def _fit_jacobian(form: Form, knots: _Knots, values: FloatArray, high: FloatArray) -> FloatArray:
     """Derivative (k, p) by differences over small steps, which end within the bounds."""
-    steps = TANGENT_SHARE * np.maximum(np.abs(values), 1.0)
+    steps = FIT_DIFFERENCE_SHARE * np.maximum(np.abs(values), 1.0)
     steps = np.where(values + steps > high, -steps, steps)
     moved = knots.difference(form, np.concatenate([values[None], values + np.diag(steps)]))
     return np.asarray((moved[1:] - moved[0]).T / steps)

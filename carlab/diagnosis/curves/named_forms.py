@@ -56,8 +56,8 @@ class Form:
         Returns:
             (n,) or (A, B); (m, n) or (m, A, B) for m sets.
         """
-        sets = np.broadcast_shapes(*(np.shape(p) for p in parameters), inputs[0].shape)
-        return np.broadcast_to(self.function(*parameters, *inputs), sets)
+        shape = np.broadcast_shapes(*(np.shape(p) for p in parameters), inputs[0].shape)
+        return np.broadcast_to(self.function(*parameters, *inputs), shape)
 
 
 def dead_band(x: FloatArray, width: float) -> FloatArray:

@@ -111,16 +111,16 @@ class _Regression:
         vx: speed at the rows (n,).
         base: orthonormal functions of the speed (n, b).
         target: residual of the motion in the regression on ``base`` (n,).
-        before: rows of the grid at or before each delayed time (L, n).
-        share: position of the delayed times between that row and the next one (L,).
+        rows_before: rows of the grid at or before the delayed times (L, n).
+        next_row_weight: weight of the next row in the linear interpolation at the delayed times (L,).
     """
 
     channel: str
     vx: FloatArray
     base: FloatArray
     target: FloatArray
-    before: NDArray[np.intp]
-    share: FloatArray
+    rows_before: NDArray[np.intp]
+    next_row_weight: FloatArray
 
     @classmethod
     def of(cls, motion: GridMotion, channel: str, rows: NDArray[np.intp]) -> _Regression:
@@ -132,15 +132,14 @@ class _Regression:
         base = np.linalg.qr(np.column_stack(columns))[0]
         values = rate if channel == "steering" else motion.acceleration[rows]
         lags = LAGS_S / motion.period_s
-        whole = np.ceil(lags - 1e-9)
-        before = np.clip(rows - whole[:, None].astype(np.intp), 0, len(motion.t_s) - 2)
-        return cls(channel, vx, base, values - base @ (base.T @ values), before, whole - lags)
+        whole_lags = np.ceil(lags - 1e-9)
+        rows_before = np.clip(rows - whole_lags[:, None].astype(np.intp), 0, len(motion.t_s) - 2)
+        return cls(channel, vx, base, values - base @ (base.T @ values), rows_before, whole_lags - lags)
 
     def delayed(self, filtered: FloatArray, lag: int) -> FloatArray:
-        """The command on the grid, at the rows before a lag (n,)."""
-        share = self.share[lag]
-        first = filtered[self.before[lag]]
-        return np.asarray(first + share * (filtered[self.before[lag] + 1] - first))
+        """The command at the delayed times of a lag (n,), interpolated on the grid."""
+        first, second = filtered[self.rows_before[lag]], filtered[self.rows_before[lag] + 1]
+        return np.asarray(first + self.next_row_weight[lag] * (second - first))
 
     def terms(self, command: FloatArray) -> FloatArray:
         """Functions (k, n) of the delayed command (n,)."""
@@ -152,18 +151,19 @@ class _Regression:
 
     def fit(self, filtered: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Shares of variance explained (L,) and coefficients (L, k), in addition to ``base``, at each lag."""
-        known = np.column_stack([self.base, self.target])
+        base_and_target = np.column_stack([self.base, self.target])
         products = []
         for lag in range(len(LAGS_S)):
             terms = self.terms(self.delayed(filtered, lag))
-            products.append((terms @ known, terms @ terms.T))
-        by_known, normal = (np.stack(part) for part in zip(*products, strict=True))
-        by_base, product = by_known[:, :, :-1], by_known[:, :, -1]
+            products.append((terms @ base_and_target, terms @ terms.T))
+        projections, normal = (np.stack(part) for part in zip(*products, strict=True))
+        by_base, by_target = projections[:, :, :-1], projections[:, :, -1]
         normal = normal - by_base @ by_base.transpose(0, 2, 1)
         ridge = 1e-9 * np.eye(normal.shape[1])
-        solved = (np.linalg.pinv(normal + ridge, hermitian=True) @ product[:, :, None])[:, :, 0]
-        left = np.einsum("lk,lkj,lj->l", solved, normal, solved) - 2.0 * np.einsum("lk,lk->l", solved, product)
-        return -left / float(self.target @ self.target), solved
+        coefficients = (np.linalg.pinv(normal + ridge, hermitian=True) @ by_target[:, :, None])[:, :, 0]
+        quadratic = np.einsum("lk,lkj,lj->l", coefficients, normal, coefficients)
+        explained_squares = 2.0 * np.einsum("lk,lk->l", coefficients, by_target) - quadratic
+        return explained_squares / float(self.target @ self.target), coefficients
 
     def predicted(self, filtered: FloatArray, lag: int, coefficients: FloatArray) -> FloatArray:
         """What the terms explain (n,) at a lag, in addition to ``base``."""
@@ -189,11 +189,11 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
     explained = np.zeros(len(LAGS_S))
     best_share, time_constant, lag, coefficients = -np.inf, 0.0, 0, np.zeros(0)
     for time_constant_s in TIME_CONSTANTS_S:
-        shares, solved = regression.fit(first_order_lag(smooth, motion.period_s, time_constant_s))
+        shares, by_lag = regression.fit(first_order_lag(smooth, motion.period_s, time_constant_s))
         explained = np.maximum(explained, shares)
         if shares.max() > best_share:
             lag = int(np.argmax(shares))
-            best_share, time_constant, coefficients = float(shares[lag]), time_constant_s, solved[lag]
+            best_share, time_constant, coefficients = float(shares[lag]), time_constant_s, by_lag[lag]
     filtered = first_order_lag(smooth, motion.period_s, time_constant)
     predicted = np.stack([regression.predicted(filtered, k, coefficients) for k in range(len(LAGS_S))])
     lever = regression.delayed(filtered, lag)
