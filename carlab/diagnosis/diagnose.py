@@ -36,6 +36,7 @@ from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
 from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import with_known_latency
+from carlab.diagnosis.uncertain_effects import without_uncertain_effects
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.network_ensemble import EnsembleSettings, check_duration, train_ensemble
@@ -214,7 +215,12 @@ def _search_effects(
     else:
         naming = NamingResult(found, residual_of(problem, found), None, vibration)
     control.progress("scoring on held-out recordings", 0.82)
-    return ScoredSearch.of(problem, naming.found, held_out), naming
+    scored = ScoredSearch.of(problem, naming.found, held_out)
+    if request.effects is None:
+        scored = without_uncertain_effects(scored, search_control)
+    if scored.found.effects != naming.found.effects:
+        naming = replace(naming, found=scored.found, residual=residual_of(problem, scored.found))
+    return scored, naming
 
 
 def _assemble_result(

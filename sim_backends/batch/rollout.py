@@ -203,11 +203,13 @@ class _Batch:
         """Convert a tensor to the array type of the equations."""
         return value.numpy() if self.on_arrays and isinstance(value, torch.Tensor) else value
 
+    def _block(self, rows: Any) -> Value:
+        """Rows of six, one for each tick, as one array or tensor (ticks, 6, cars)."""
+        return np.array(rows) if self.on_arrays else torch.stack([torch.stack(row) for row in rows])
+
     def _stacked(self, rows: Any) -> torch.Tensor:
         """Rows of six, one for each tick, as a tensor (ticks, 6, cars)."""
-        if self.on_arrays:
-            return torch.from_numpy(np.array(rows))
-        return torch.stack([torch.stack(row) for row in rows])
+        return torch.as_tensor(self._block(rows))
 
     def run(self, measured: bool) -> Rollout:
         latency_s = MeasurementModel(self.ops, self.numbers, self.config.effects).latency_s if measured else 0.0
@@ -259,16 +261,23 @@ class _Batch:
         t_s = self.t0_s - before * self.period_s
         actuation = self.model.actuation(*self.chain.settled_output((oldest[0], oldest[1])))
         extra = self.model.settled(t_s, ticks[0], actuation)
-        for k in range(before):
-            for piece, commands in zip(pieces, acting, strict=True):
-                share = piece.start_s * (1.0 / self.period_s)
-                body = tuple(a + (b - a) * share for a, b in zip(ticks[k], ticks[k + 1], strict=True))
-                moment = _Moment((*body, *extra), memory, body[3:6])
+        if not before:
+            return extra, memory
+        first = _Moment((*ticks[0], *extra), memory, ticks[0][3:6])
+        end = self._advance(first, list(self._history_segments(pieces, acting, self._block(ticks), t_s)), None)[-1]
+        return end.state[6:], end.memory
+
+    def _history_segments(
+        self, pieces: list[_Piece], acting: list[tuple[Value, ...]], ticks: Value, t_s: Value
+    ) -> Iterator[Segment]:
+        """The pieces of the periods between the states ``ticks`` (n, 6, cars), each from the interpolated state."""
+        shares = [piece.start_s * (1.0 / self.period_s) for piece in pieces]
+        bodies = [ticks[:-1] + (ticks[1:] - ticks[:-1]) * share for share in shares]
+        for k in range(len(ticks) - 1):
+            for piece, commands, body in zip(pieces, acting, bodies, strict=True):
                 held = (Row(commands[0], k), Row(commands[1], k))
                 begin_s = t_s + k * self.period_s + piece.start_s
-                [moment] = self._advance(moment, [Segment(begin_s, held, piece.step_s, piece.steps)], None)
-                extra, memory = moment.state[6:], moment.memory
-        return extra, memory
+                yield Segment(begin_s, held, piece.step_s, piece.steps, body=Row(body, k))
 
     def _segments(
         self, pieces: list[_Piece], acting: list[tuple[Value, ...]], before: int, measured: bool
@@ -299,8 +308,10 @@ class _Batch:
     def _advance_by_operators(
         self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None
     ) -> Iterator[_Moment]:
-        for t_s, (steering, throttle), step_s, steps, for_measurement in segments:
+        for t_s, (steering, throttle), step_s, steps, for_measurement, body in segments:
             moment, held = now, (steering.value, throttle.value)
+            if body is not None:
+                moment = now._replace(state=(*body.value, *now.state[6:]))
             for i in range(steps):
                 state, memory = integrate_held(
                     self.model, self.chain, t_s + i * step_s, moment.state, moment.memory, held, step_s, 1

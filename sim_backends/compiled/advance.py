@@ -7,6 +7,7 @@ effects, and compiled to machine code: loops over segments and integration steps
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -30,6 +31,9 @@ from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.effects import EFFECTS, Effect
 from sim_backends.measurement import MeasurementModel, filter_step
 from sim_backends.registry import REGISTRY
+
+BODY_ROWS = 6
+"""Rows of the state of the body: x, y, yaw, vx, vy, yaw rate."""
 
 
 class Key(NamedTuple):
@@ -97,7 +101,8 @@ def compile_advance(key: Key, dtype: np.dtype[Any]) -> MachineCode:
     """Compile the loops over segments and steps."""
     graph = trace_step(key)
     parameters = list(graph.parameters.values())
-    return compile_segments(parameters, graph.commands, graph.step_s, graph.t_s, graph.carried, graph.outputs, dtype)
+    clock = graph.step_s, graph.t_s
+    return compile_segments(parameters, graph.commands, *clock, graph.carried, BODY_ROWS, graph.outputs, dtype)
 
 
 @functools.lru_cache(maxsize=512)
@@ -121,14 +126,14 @@ def compile_gradient(key: Key, wanted: tuple[bool, ...], dtype: np.dtype[Any]) -
 
 
 class Row(NamedTuple):
-    """A row of a matrix (rows, cars); its address follows from that of the matrix."""
+    """A row of a matrix (rows, cars), or a block of (blocks, 6, cars); its address follows from that of the whole."""
 
     matrix: Value
     number: int
 
     @property
     def value(self) -> Value:
-        """The row (cars,)."""
+        """The row (cars,), or the block (6, cars)."""
         return self.matrix[self.number]
 
 
@@ -144,6 +149,8 @@ class Segment(NamedTuple):
     steps: int
     for_measurement: bool = False
     """Whether the segment only leads to a capture: the next one starts where this one started."""
+    body: Row | None = None
+    """Block (6, cars) of the state of the body at the start; by default that at the end of the segment before."""
 
 
 class CompiledCars:
@@ -178,6 +185,8 @@ class CompiledCars:
         found = []
         for segment in segments:
             commands = (row.value for row in segment.commands)
+            if segment.body is not None:
+                carried = (*segment.body.value, *carried[BODY_ROWS:])
             given = (*self._parameters, segment.step_s, *commands, segment.t_s, *carried)
             after = tuple(_Advance.apply(self._key, segment.steps, *given))  # type: ignore[no-untyped-call]
             found.append(after)
@@ -199,11 +208,13 @@ def _run(
     uses_time = trace_step(key).uses_time
     out, size = results.ctypes.data, results.strides[0]
     lines = []
-    for k, (t_s, (steering, throttle), step_s, steps, for_measurement) in enumerate(segments):
+    for k, (t_s, (steering, throttle), step_s, steps, for_measurement, body) in enumerate(segments):
         step = rows.address(step_s)
         time = rows.address(t_s) if uses_time else step
         commands = rows.address_in(*steering), rows.address_in(*throttle)
-        lines.append((steps, for_measurement, step, time, *commands, out + k * size))
+        end = out + k * size
+        start = end if body is None else rows.address_in(*body)  # without a body the code ignores the numbers
+        lines.append((steps, for_measurement, body is not None, step, time, *commands, start, end))
     table = np.array(lines, np.uint64)
     if segments:
         code.call(rows.length, len(segments), inputs.ctypes.data, table.ctypes.data)
@@ -226,18 +237,21 @@ class _Rows:
         return self._known[key][1]
 
     def address_in(self, matrix: Value, index: int) -> int:
-        """Address of a row of a matrix."""
-        if matrix.shape[1] != self.length:
+        """Address of a row of a matrix (rows, cars), or of a block of (blocks, 6, cars)."""
+        shape: tuple[int, ...] = matrix.shape
+        if shape[-1] != self.length:
             return self.address(matrix[index])
-        return self.address(matrix) + index * self.length * self.dtype.itemsize
+        return self.address(matrix) + index * self.dtype.itemsize * math.prod(shape[1:])
 
 
 def _as_row(value: Value, cars: int, dtype: np.dtype[Any]) -> FloatRow:
-    """A number, array or tensor as a contiguous row, or a matrix of such rows as it is."""
+    """A number, array or tensor as a contiguous row, or an array (..., cars) of such rows; short rows are repeated."""
     if isinstance(value, torch.Tensor):
         value = value.detach().numpy()
     if isinstance(value, np.ndarray) and value.ndim:
-        return np.ascontiguousarray(value if value.shape[-1] == cars else np.resize(value, cars), dtype)
+        if value.shape[-1] not in (0, cars):
+            value = value[..., np.arange(cars) % value.shape[-1]]
+        return np.ascontiguousarray(value if value.size else np.zeros((*value.shape[:-1], cars)), dtype)
     return np.full(cars, value, dtype)
 
 

@@ -92,9 +92,9 @@ class MachineCode:
 class SegmentTable:
     """Columns of the table of segments: whole numbers, and addresses of rows."""
 
-    STEPS, FOR_MEASUREMENT, STEP, TIME, STEERING, THROTTLE, OUT = range(7)
+    STEPS, FOR_MEASUREMENT, HAS_START, STEP, TIME, STEERING, THROTTLE, START, OUT = range(9)
     """Number of steps (one or more); whether the segment is for a measurement, so that the next one starts where it
-    started; then addresses."""
+    started; whether its first carried rows have given values at the start; then addresses."""
 
 
 def addresses(rows: Iterable[FloatRow]) -> NDArray[np.uint64]:
@@ -118,23 +118,25 @@ def compile_segments(
     step: Node,
     time: Node,
     carried: Sequence[Node],
+    body_rows: int,
     outputs: Sequence[Any],
     dtype: np.dtype[Any],
 ) -> MachineCode:
     """Compile loops over segments and their steps; ``outputs`` become the next ``carried``.
 
     The input rows are ``parameters`` and ``carried``. The output is a table of segments (``SegmentTable``), with the
-    addresses of the rows ``held``, ``step`` and ``time`` at the start, and of the block of carried rows at the end.
-    Each operation runs in the outermost loop that has its arguments.
+    addresses of the rows ``held``, ``step`` and ``time`` at the start, of the block of the first ``body_rows`` carried
+    rows at the start if they are given, and of the block of carried rows at the end. Each operation runs in the outer
+    loop that has its arguments.
     """
     writer, names = _load_inputs([*parameters, *carried], dtype)
     at_start = [names.pop(node.index) for node in carried]
     at_segment = [writer.variable() for _ in carried]
     at_step = [writer.variable() for _ in (time, *carried)]
     before, writer.lines = writer.lines, []
-    steps, for_measurement, rows = _segment_columns(writer)
-    for node, row in zip((step, time, *held), rows, strict=False):
-        names[node.index] = _load_row(writer, row)
+    (steps, for_measurement, has_start), (*rows, given_start, end) = _segment_columns(writer)
+    names |= {node.index: _load_row(writer, row) for node, row in zip((step, time, *held), rows, strict=True)}
+    first_step = _start_of_segment(writer, given_start, has_start, at_segment, body_rows)
     start_time, segment = names[time.index], writer.lines
     names |= {node.index: name for node, name in zip((time, *carried), at_step, strict=True)}
     depths = {node.index: 1 for node in (step, *held)} | {node.index: 2 for node in (time, *carried)}
@@ -143,22 +145,20 @@ def compile_segments(
     writer.lines = body
     after = [writer.add(names[time.index], names[step.index]), *(_value(writer, o, names) for o in outputs)]
     ends = writer.lines = list[str]()
-    next_start = _end_of_segment(writer, rows[-1], for_measurement, at_segment, after[1:])
+    next_start = _end_of_segment(writer, end, for_measurement, first_step, after[1:])
     writer.lines = before
-    next_segment = zip(at_segment, at_start, next_start, strict=True)
-    next_step = zip(at_step, [start_time, *at_segment], after, strict=True)
     rest = [
         "  br label %segments",
         "segments:",
         "  %j = phi i64 [ 0, %vector ], [ %j_next, %ends ]",
-        *(f"  {name} = phi {writer.type} [ {a}, %vector ], [ {b}, %ends ]" for name, a, b in next_segment),
+        *_phis(writer, at_segment, "%vector", at_start, "%ends", next_start),
         f"  %place = mul i64 %j, {SegmentTable.OUT + 1}",
         "  %segment = getelementptr i64, ptr %out, i64 %place",
         *segment,
         "  br label %step",
         "step:",
         "  %k = phi i64 [ 0, %segments ], [ %k_next, %step ]",
-        *(f"  {name} = phi {writer.type} [ {a}, %segments ], [ {b}, %step ]" for name, a, b in next_step),
+        *_phis(writer, at_step, "%segments", [start_time, *first_step], "%step", after),
         *body,
         "  %k_next = add i64 %k, 1",
         f"  %again = icmp slt i64 %k_next, {steps}",
@@ -173,13 +173,24 @@ def compile_segments(
     return _compile(writer, rest)
 
 
-def _segment_columns(writer: VectorWriter) -> tuple[Name, Name, list[Name]]:
-    """Number of steps, whether the segment is for a measurement, and addresses of the rows of the segment."""
+def _phis(
+    writer: VectorWriter,
+    names: Sequence[Name],
+    before: str,
+    first: Sequence[Name],
+    loop: str,
+    following: Sequence[Name],
+) -> list[str]:
+    """Variables of a loop: ``first`` when entered from the block ``before``, ``following`` from the block ``loop``."""
+    rows = zip(names, first, following, strict=True)
+    return [f"  {name} = phi {writer.type} [ {a}, {before} ], [ {b}, {loop} ]" for name, a, b in rows]
+
+
+def _segment_columns(writer: VectorWriter) -> tuple[list[Name], list[Name]]:
+    """The whole numbers of the segment and its addresses, both in the order of ``SegmentTable``."""
     columns = [writer.write(f"getelementptr i64, ptr %segment, i64 {k}") for k in range(SegmentTable.OUT + 1)]
-    steps, for_measurement = (
-        writer.write(f"load i64, ptr {columns[k]}") for k in (SegmentTable.STEPS, SegmentTable.FOR_MEASUREMENT)
-    )
-    return steps, for_measurement, [writer.write(f"load ptr, ptr {column}") for column in columns[SegmentTable.STEP :]]
+    numbers, rows = columns[: SegmentTable.STEP], columns[SegmentTable.STEP :]
+    return [writer.write(f"load i64, ptr {c}") for c in numbers], [writer.write(f"load ptr, ptr {c}") for c in rows]
 
 
 def _write_by_depth(
@@ -196,17 +207,34 @@ def _write_by_depth(
         names[node.index] = _operation(writer, node, names)
 
 
+def _start_of_segment(
+    writer: VectorWriter, block: Name, has_start: Name, carried: Sequence[Name], body: int
+) -> list[Name]:
+    """The carried values, of which the first ``body`` are those of the block if the segment has a start."""
+    given = [_load_row(writer, _row_of_block(writer, block, k)) for k in range(body)]
+    return [*_selected(writer, has_start, given, carried[:body]), *carried[body:]]
+
+
 def _end_of_segment(
     writer: VectorWriter, block: Name, for_measurement: Name, before: Sequence[Name], after: Sequence[Name]
 ) -> list[Name]:
     """Store the carried values; the next segment starts with them, or after a measurement with those before."""
     for k, value in enumerate(after):
-        offset = writer.write(f"mul i64 %cars, {k}")
-        _store_row(writer, writer.write(f"getelementptr {writer.number}, ptr {block}, i64 {offset}"), value)
-    restarts = writer.write(f"icmp ne i64 {for_measurement}, 0")
-    kind = writer.type
-    pairs = zip(before, after, strict=True)
-    return [writer.write(f"select i1 {restarts}, {kind} {old}, {kind} {new}") for old, new in pairs]
+        _store_row(writer, _row_of_block(writer, block, k), value)
+    return _selected(writer, for_measurement, before, after)
+
+
+def _row_of_block(writer: VectorWriter, block: Name, k: int) -> Name:
+    """The address of a row of a block (rows, cars)."""
+    offset = writer.write(f"mul i64 %cars, {k}")
+    return writer.write(f"getelementptr {writer.number}, ptr {block}, i64 {offset}")
+
+
+def _selected(writer: VectorWriter, flag: Name, yes: Sequence[Name], no: Sequence[Name]) -> list[Name]:
+    """The values ``yes`` if the whole number ``flag`` is not 0, the values ``no`` otherwise."""
+    is_set = writer.write(f"icmp ne i64 {flag}, 0")
+    pairs = zip(yes, no, strict=True)
+    return [writer.write(f"select i1 {is_set}, {writer.type} {a}, {writer.type} {b}") for a, b in pairs]
 
 
 def _load_inputs(inputs: Sequence[Node], dtype: np.dtype[Any]) -> tuple[VectorWriter, dict[int, Name]]:

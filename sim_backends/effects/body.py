@@ -35,18 +35,34 @@ class YawDamping(DynamicsEffect):
 
 
 class TorqueSteer(DynamicsEffect):
-    """``M += coefficient u``, u the throttle that acts."""
+    """``M += coefficient u + lever F_x``, u the throttle that acts, F_x the force of the driven axle.
+
+    The first term is the reaction of a motor across the car, the second a drive force beside the centre of mass. F_x is
+    drive less damping, after a traction limit or wheel slip.
+    """
 
     id = "torque_steer"
     name = "torque steer"
-    summary = "Torque steer: a yaw moment proportional to the throttle."
-    sentence = "full throttle turns the car to the {coefficient:left|right} with a moment of {coefficient:size}"
+    summary = "Torque steer: a yaw moment proportional to the throttle or to the force of the driven axle."
+    sentence = (
+        "driving turns the car, with a moment of {coefficient} times the throttle plus {lever} times the force of the "
+        "driven axle (positive: to the left)"
+    )
     refuted_if = "the car also pulls to that side when it rolls without throttle"
-    parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),)
+    parameters = (
+        EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),
+        EffectParameter("lever", "m", 0.0, -1.0, 1.0, 0.01),
+    )
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Each term alone, with both signs."""
+        sides = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+        return probe.points(probe.sized({"coefficient": c, "lever": m} for c, m in sides))
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add the moment."""
-        forces.moment = forces.moment + values["coefficient"] * forces.throttle
+        moment = values["coefficient"] * forces.throttle + values["lever"] * forces.axle_force
+        forces.moment = forces.moment + moment
 
 
 class LateralBias(DynamicsEffect):

@@ -5,10 +5,13 @@ Acting order: dead band, nonlinearity, lag. Throttle in [-1, 1].
 
 from __future__ import annotations
 
+from carlab.core.quantities import FloatArray
 from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters
+from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, ScreeningProbe
 
 _MIN_THROTTLE = 1e-12
+_CUBIC_SHARES = (0.0, 1.0)
+"""Shares of the cubic term of an "expo" curve: less than 0 would be a saturation, above 1 the curve falls around 0."""
 
 
 class ThrottleDeadband(ActuatorEffect):
@@ -39,17 +42,27 @@ class ThrottleDeadband(ActuatorEffect):
 
 
 class ThrottleNonlinearity(ActuatorEffect):
-    """``u = sign(u_t) |u_t|^exponent``."""
+    """``u = sign(u_t) |u_t|^exponent``, or with the curve "expo" ``u = (1 - k) u_t + k u_t^3``, k = (exponent - 1) / 2.
+
+    "expo" is the curve of remote controls, with k between 0 and 1. Both are linear with exponent 1 and cubic with
+    exponent 3.
+    """
 
     id = "throttle_nonlinearity"
     represented_by = "drive_map"
     name = "a curved throttle response"
     summary = "The motor's force is not proportional to the throttle command."
-    sentence = "the motor's force grows with the throttle to the power of {exponent}, not in proportion to it"
+    sentence = (
+        "the motor's force is not proportional to the throttle; it follows a curve of the kind "
+        "{curve:choice power|expo} with exponent {exponent}"
+    )
     refuted_if = "the curve has a sharp corner (a dead band or a limit) rather than a bend over the whole range"
     command = "throttle"
     order = 20
-    parameters = (EffectParameter("exponent", "1", 1.0, 0.0, 5.0, 1.3, positive=True),)
+    parameters = (
+        EffectParameter("exponent", "1", 1.0, 0.0, 5.0, 1.3, positive=True),
+        EffectParameter("curve", "1", 0.0, 0.0, 1.0, 0.0, choices=("power", "expo")),
+    )
     confusable = (
         Confusable(
             "motor_saturation",
@@ -63,9 +76,16 @@ class ThrottleNonlinearity(ActuatorEffect):
         ),
     )
 
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Powers above and below 1, and the other curve."""
+        curves = ({"exponent": e, "curve": c} for e, c in ((1.0, 0.0), (-1.0, 0.0), (1.0, 1.0)))
+        return probe.points(probe.sized(curves, held=("curve",)))
+
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Power of the size; at zero, where a power has no derivative, the command itself."""
+        """The curve; the power has no derivative at zero, so there it is the command itself."""
         size = ops.abs(command)
         large = size > _MIN_THROTTLE
         power = ops.pow(ops.where(large, size, 1.0), values["exponent"])
-        return ops.where(large, ops.sign(command) * power, command)
+        cubic = ops.clip(0.5 * (values["exponent"] - 1.0), *_CUBIC_SHARES)
+        expo = command + cubic * command * (size * size - 1.0)
+        return ops.where(values["curve"] < 0.5, ops.where(large, ops.sign(command) * power, command), expo)

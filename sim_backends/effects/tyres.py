@@ -139,10 +139,11 @@ class LowFrictionPatch(DynamicsEffect):
 
 
 class FrictionEllipse(DynamicsEffect):
-    """``F_rear *= sqrt(1 - clip(scale F_x / (mu F_z,rear), -0.98, 0.98)^2)``.
+    """``F_rear = k F``, or ``F_rear = clip(F, -k mu F_z, k mu F_z)`` where ``action`` is "limits"; F is without effect.
 
-    F_x is that of the driven axle (drive less damping, after a traction limit or wheel slip). Source: the friction
-    ellipse, Pacejka 2012, "Tire and Vehicle Dynamics", ch. 1.
+    ``k = sqrt(1 - clip(scale F_x / (mu F_z), -0.98, 0.98)^2)``: the ellipse scales the side force at every slip angle,
+    or only limits it. F_x is that of the driven axle (drive less damping, after a traction limit or wheel slip).
+    Source: the friction ellipse, Pacejka 2012, "Tire and Vehicle Dynamics", ch. 1.
     """
 
     id = "friction_ellipse"
@@ -150,13 +151,17 @@ class FrictionEllipse(DynamicsEffect):
     name = "grip shared between driving and cornering"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (
-        "driving and braking take side force from rear tyres, as a friction circle at {scale} times the drive force"
+        "driving and braking take side force from rear tyres: a friction circle at {scale} times the drive force "
+        "{action:choice scales|limits} it"
     )
     refuted_if = (
         "driving and braking change the handling balance in opposite directions (then load moves between axles)"
     )
     order = 10
-    parameters = (EffectParameter("scale", "1", 0.0, 0.0, 10.0, 0.6),)
+    parameters = (
+        EffectParameter("scale", "1", 0.0, 0.0, 10.0, 0.6),
+        EffectParameter("action", "1", 0.0, 0.0, 1.0, 0.0, choices=("scales", "limits")),
+    )
     confusable = (
         Confusable(
             "load_transfer",
@@ -169,10 +174,17 @@ class FrictionEllipse(DynamicsEffect):
     )
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scale the rear's side force."""
+        """Scale or limit the rear's side force."""
         peak = ops.at_least(forces.grip_rear * forces.load_rear, 1e-6)
         share = ops.clip(values["scale"] * forces.axle_force / peak, -MAX_SHARE, MAX_SHARE)
-        forces.side_rear = forces.side_rear * ops.sqrt(1.0 - share * share)
+        left = ops.sqrt(1.0 - share * share)
+        limited = ops.clip(forces.side_rear, -left * peak, left * peak)
+        forces.side_rear = ops.where(values["action"] < 0.5, left * forces.side_rear, limited)
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Both actions at several scales."""
+        both = ({"scale": 1.0, "action": float(k)} for k in range(2))
+        return probe.points(probe.sized(both, held=("action",)))
 
 
 class TyreRelaxation(DynamicsEffect):

@@ -69,9 +69,11 @@ def test_sentence_of_an_effect_contains_each_parameter_with_its_unit(effect_id: 
     assert sentence.endswith(".")
     assert sentence.count(" at 90 %") == 1
     assert not re.search(r"[{}_]|nan|unknown|  ", sentence)
-    hidden = {"B_front", "C_front", "B_rear", "C_rear", "axle"}  # shape factors are not in the sentence
+    hidden = {"B_front", "C_front", "B_rear", "C_rear"}  # shape factors are not in the sentence
     for p in CATALOGUE[effect_id].parameters:
-        if p.name in hidden:
+        if p.choices:
+            assert p.choices[0] in sentence
+        if p.choices or p.name in hidden:
             continue
         shown = {number(abs(p.typical)), number(100 * abs(p.typical)), number(6000 * abs(p.typical))}
         assert any(re.search(rf"(?<![\d.]){re.escape(n)} ", sentence) for n in shown), (p.name, sentence)

@@ -39,6 +39,8 @@ CASES = {
     "friction_drift": {"friction_drift": {"rate": -0.5}},
     "traction_limit_all": {"traction_limit": {"share": 0.5, "axle": "all"}},
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
+    "limited_ellipse": {"friction_ellipse": {"scale": 0.9, "action": "limits"}},
+    "lever_with_traction": {"torque_steer": {"lever": -0.02}, "traction_limit": {"share": 0.6}},
     "slow_roll": {"roll_dynamics": {"frequency": 1.2, "damping": 0.2}},
     "soft_roll": {"roll_dynamics": {"frequency": 2.0, "damping": 0.4, "sensitivity": 2.5}},
     "long_relaxation": {"tyre_relaxation": {"length": 0.6}},
@@ -148,8 +150,6 @@ def reference_rates(t, s, d, u, p, e):
         body_y += e["lateral_bias"]["force"]
     if has("yaw_damping"):
         moment -= e["yaw_damping"]["coefficient"] * r
-    if has("torque_steer"):
-        moment += e["torque_steer"]["coefficient"] * u
 
     if has("wind"):
         q = e["wind"]
@@ -201,8 +201,12 @@ def reference_rates(t, s, d, u, p, e):
         force = limit * math.tanh(q["stiffness"] * (rim - vx) / max(abs(vx), 0.3) / limit)
         rim_rate = RADIUS**2 / q["inertia"] * (demand - force)
     if has("friction_ellipse"):
-        used = e["friction_ellipse"]["scale"] * force / (mu_rear * z_rear)
-        f_rear *= math.sqrt(1 - min(max(used, -0.98), 0.98) ** 2)
+        q, peak = e["friction_ellipse"], mu_rear * z_rear
+        left = math.cos(math.asin(min(max(q["scale"] * force / peak, -0.98), 0.98)))
+        sharp = math.copysign(min(abs(f_rear), left * peak), f_rear)
+        f_rear = sharp if q.get("action") == "limits" else left * f_rear
+    if has("torque_steer"):
+        moment += np.dot([e["torque_steer"].get(name, 0.0) for name in ("coefficient", "lever")], [u, force])
     roll_acc = 0.0
     if has("roll_dynamics"):
         q = e["roll_dynamics"]

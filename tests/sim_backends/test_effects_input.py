@@ -100,6 +100,9 @@ def test_static_throttle_effects_have_their_closed_forms():
         for exponent in (0.5, 1.3, 2.0):
             found = throttle({"throttle_nonlinearity": {"exponent": exponent}}, u)
             assert found == pytest.approx(np.sign(u) * size**exponent)
+        for exponent, share in ((0.5, 0.0), (1.0, 0.0), (2.2, 0.6), (3.0, 1.0), (4.5, 1.0)):
+            found = throttle({"throttle_nonlinearity": {"exponent": exponent, "curve": "expo"}}, u)
+            assert found == pytest.approx(np.polyval([share, 0.0, 1.0 - share, 0.0], u))
 
 
 def test_effects_act_in_the_documented_order():

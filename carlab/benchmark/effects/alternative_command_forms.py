@@ -134,9 +134,9 @@ def two_lags(world: World, p: Parameters) -> None:
 
 
 def throttle_curve(world: World, p: Parameters) -> None:
-    """The exponential curve of a remote control: a mix of linear and cubic."""
-    mix = p["mix"]
-    world.throttle_maps.append(lambda u: (1.0 - mix) * u + mix * u**3)
+    """A speed controller with an exponential curve."""
+    bend = max(p["bend"], 1e-9)
+    world.throttle_maps.append(lambda u: math.copysign(math.expm1(bend * abs(u)) / math.expm1(bend), u))
 
 
 def seeded(key: str) -> Callable[[float, Draw], dict[str, float]]:
@@ -161,6 +161,6 @@ FORMS = (
     Form("steering_deadband", "other", plain("width"), soft_deadband, 0.01, 0.4),
     Form("steering_nonlinearity", "other", inverse("saturation"), linkage, 0.7, 2.2),
     Form("throttle_deadband", "other", plain("width"), soft_throttle_deadband, 0.01, 0.4),
-    Form("throttle_nonlinearity", "other", plain("mix"), throttle_curve, 0.1, 0.95),
+    Form("throttle_nonlinearity", "other", plain("bend"), throttle_curve, 0.2, 4.0),
     Form("motor_lag", "other", plain("time_constant"), two_lags, 0.03, 1.0),
 )

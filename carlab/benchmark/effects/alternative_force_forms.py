@@ -109,17 +109,14 @@ def brush_tyre(world: World, p: Parameters) -> None:
     world.hooks["grip"].insert(0, grip)
 
 
-def friction_circle(world: World, p: Parameters) -> None:
-    """The side force is limited at the friction circle and unchanged inside it."""
+def combined_slip(world: World, p: Parameters) -> None:
+    """The weighting function cos(atan(k)) of the magic formula for combined slip (Pacejka, section 4.3.2)."""
     scale = p["scale"]
 
-    def cut(now: Instant) -> None:
-        top = now.mu_r * now.fz_r
-        used = min(abs(scale * now.fx), 0.98 * top)
-        left = math.sqrt(top * top - used * used)
-        now.fr = min(max(now.fr, -left), left)
+    def weigh(now: Instant) -> None:
+        now.fr /= math.hypot(1.0, scale * now.fx / (now.mu_r * now.fz_r))
 
-    world.hooks["tyre"].append(cut)
+    world.hooks["tyre"].append(weigh)
 
 
 def brush_slip(world: World, p: Parameters) -> None:
@@ -213,11 +210,12 @@ def viscous_yaw(world: World, p: Parameters) -> None:
 
 
 def torque_by_force(world: World, p: Parameters) -> None:
-    """The moment is proportional to the axle force, not to the throttle."""
-    c = p["coefficient"] / world.car.drive_gain
+    """The axle force acts beside the centre of mass; its lever grows with it, as the suspension yields."""
+    c, gain = p["coefficient"], world.car.drive_gain
 
     def pull(now: Instant) -> None:
-        now.moment += c * now.fx
+        share = now.fx / gain
+        now.moment += c * share * (0.5 + abs(share))
 
     world.hooks["body"].append(pull)
 
@@ -271,7 +269,7 @@ FORMS = (
     ),
     Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
     Form("tyre_saturation", "other", saturating, brush_tyre, 0.5, 1.6, nominal_kind="linear_tyre"),
-    Form("friction_ellipse", "other", plain("scale"), friction_circle, 0.6, 2.5),
+    Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
     Form(
         "longitudinal_slip",
         "other",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,13 @@ class Fit:
     def values(self) -> dict[str, float]:
         """Fitted values by dotted name."""
         return {f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)}
+
+
+class Linearised(NamedTuple):
+    """Whitened errors (S, U, 6) and their Jacobian (n, S, U, 6)."""
+
+    jacobian: FloatArray
+    white: FloatArray
 
 
 class Fitter:
@@ -243,11 +251,16 @@ class Fitter:
         loss = self.huber(white).sum(axis=(1, 2))
         return Fit(fitted, free, z, cost, np.asarray(loss))
 
-    def with_covariance(self, fit: Fit) -> Fit:
-        """The same fit with its sandwich covariance, clustered by block (White 1980; Liang and Zeger 1986)."""
+    def with_covariance(self, fit: Fit, at: Linearised | None = None) -> Fit:
+        """The same fit with its sandwich covariance, clustered by block (White 1980; Liang and Zeger 1986).
+
+        Args:
+            fit: n parameters.
+            at: the errors linearised at the fit, if they are known.
+        """
         if not fit.free:
             return replace(fit, covariance=np.zeros((0, 0)), design_effects=np.zeros(0))
-        jacobian, white = self.linearised(fit)
+        jacobian, white = at or self.linearised(fit)
         normal, score = self._normal(fit, jacobian, white)
         blocks, index = np.unique(self.windows.block, return_inverse=True)
         clustered = np.stack([np.bincount(index, weights=row, minlength=len(blocks)) for row in score])
@@ -258,18 +271,21 @@ class Fitter:
         design_effects = np.diag(sandwich) / np.maximum(np.diag(bread), 1e-30)
         return replace(fit, covariance=sandwich, design_effects=design_effects)
 
-    def leave_fold_out_loss(self, fit: Fit, folds: IndexArray, max_error: float) -> FloatArray:
+    def leave_fold_out_loss(
+        self, fit: Fit, folds: IndexArray, max_error: float, at: Linearised | None = None
+    ) -> FloatArray:
         """Loss of every window (S,) by a fit without its fold, whitened errors clipped at ``max_error``.
 
         Args:
             fit: fit to all windows.
             folds: index of each window's fold (S,).
             max_error: bound of the whitened errors.
+            at: the errors linearised at the fit, if they are known.
         """
         if not fit.free:
             return self.loss(fit.config, max_error=max_error)
         loss = np.zeros(len(self.windows))
-        for own, _, white in self._without_each_fold(fit, folds):
+        for own, _, white in self._without_each_fold(fit, folds, at or self.linearised(fit)):
             loss[own] = self.huber(white.clip(-max_error, max_error)).sum(axis=(1, 2))
         return loss
 
@@ -277,19 +293,19 @@ class Fitter:
         """Coordinates (S, n) for every window by a fit without its fold (S,)."""
         z = np.tile(fit.z, (len(self.windows), 1))
         if fit.free:
-            for own, without, _ in self._without_each_fold(fit, folds):
+            for own, without, _ in self._without_each_fold(fit, folds, self.linearised(fit)):
                 z[own] = without
         return z
 
     def _without_each_fold(
-        self, fit: Fit, folds: IndexArray
+        self, fit: Fit, folds: IndexArray, at: Linearised
     ) -> Iterator[tuple[NDArray[np.bool_], FloatArray, FloatArray]]:
         """For each fold: its windows (S,), coordinates (n,) of a fit without it, and its whitened errors.
 
         Each fold is removed from ``fit`` by one Gauss-Newton step (Beirami et al. 2017, approximate leave-k-out), at
         the cost of a few predictions; a refit costs a hundred.
         """
-        jacobian, white = self.linearised(fit)
+        jacobian, white = at
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         normal, score = self._normal(fit, jacobian, white)
         for name in np.unique(folds):
@@ -305,10 +321,10 @@ class Fitter:
             best = int(np.argmin(other_costs))
             yield own, trials[best], whites[best, own]
 
-    def linearised(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
-        """Jacobian (n, S, U, 6) of the whitened errors (S, U, 6) at a fit."""
+    def linearised(self, fit: Fit) -> Linearised:
+        """The whitened errors linearised at a fit."""
         white = self.white(fit.config, fit.free, fit.z[None])[0]
-        return self.jacobian(fit.config, fit.free, fit.z, white), white
+        return Linearised(self.jacobian(fit.config, fit.free, fit.z, white), white)
 
     def _normal(self, fit: Fit, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix (n, n) with the prior, and each window's score (n, S)."""

@@ -23,7 +23,9 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     """Refitted candidates, sorted by gain; those tested on left-out blocks come first."""
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
     screened = screen_candidates(problem, model, names, control)
-    chosen = _to_refit(problem, model, screened)
+    fitter = problem.fitter(model.scale)
+    at = fitter.linearised(model.fit)
+    chosen = _to_refit(problem, screened, fitter.with_covariance(model.fit, at).design_effect)
     done, steps = len(model.effects), problem.settings.selection.max_effects
     fitted = control.workers.map(
         refit_candidate,
@@ -35,11 +37,15 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     )
     refitted = [candidate for candidate in fitted if candidate is not None]
     refitted.sort(key=lambda c: -c.gain)
-    return _tested(problem, model, refitted, control) if refitted else ()
+    if not refitted:
+        return ()
+    limit = problem.settings.selection.max_left_out_error
+    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), limit, at)
+    return _tested(problem, model, refitted, reference, control)
 
 
 def _to_refit(
-    problem: SearchProblem, model: Model, screened: tuple[ScreeningResult, ...]
+    problem: SearchProblem, screened: tuple[ScreeningResult, ...], design_effect: float
 ) -> tuple[ScreeningResult, ...]:
     """Candidates with the best screening scores, and the confusable effects of the leading ones."""
     if not screened:
@@ -47,7 +53,6 @@ def _to_refit(
     settings = problem.settings.selection
     by_name = {result.effect: result for result in screened}
     highest = max(result.score for result in screened)
-    design_effect = problem.fitter(model.scale).with_covariance(model.fit).design_effect
     lowest = max(settings.min_score_share * highest, 0.5 * settings.min_score_chi2 * design_effect)
     names = [result.effect for result in screened if result.score > lowest][: settings.max_refits]
     for name in names[: settings.confusable_leaders]:
@@ -56,12 +61,11 @@ def _to_refit(
 
 
 def _tested(
-    problem: SearchProblem, model: Model, refitted: list[Candidate], control: RunControl
+    problem: SearchProblem, model: Model, refitted: list[Candidate], reference: FloatArray, control: RunControl
 ) -> tuple[Candidate, ...]:
-    """Test the candidates with the largest gains on left-out blocks."""
+    """Test the candidates with the largest gains on left-out blocks; ``reference`` (S,) is the loss of the model."""
     settings = problem.settings.selection
     fitter = problem.fitter(model.scale)
-    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_left_out_error)
     min_gain = settings.min_gain_share * refitted[0].gain
     count = sum(c.gain >= min_gain or k < 2 for k, c in enumerate(refitted))
     share = (len(model.effects) + 0.7) / settings.max_effects
@@ -83,8 +87,9 @@ def with_left_out_gain(
     problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray
 ) -> Candidate:
     """The candidate with its chi2 and with its gain over ``reference`` (S,) on left-out blocks."""
-    fit = fitter.with_covariance(candidate.fit)
-    loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_left_out_error)
+    at = fitter.linearised(candidate.fit)
+    fit = fitter.with_covariance(candidate.fit, at)
+    loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_left_out_error, at)
     gain, error = clustered_gain(reference, loss, problem.windows)
     chi2 = 2.0 * candidate.gain / design_effect_of(fit, candidate.effect)
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)

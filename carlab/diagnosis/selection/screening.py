@@ -97,8 +97,7 @@ class Screen:
 
     def gain(self, moved: FloatArray) -> tuple[float, float]:
         """Fall of the loss along the secant to the whitened errors ``moved`` (S, U, 6), and the best step along it."""
-        limit = self.settings.max_whitened_change
-        secant = self.projected(np.clip(moved.reshape(-1) - self.white, -limit, limit))
+        secant = self.projected(self._change(moved))
         size = float(secant @ secant)
         slope = -float(secant @ self.residual)
         along = min(max(slope / max(size, 1e-12), 0.0), self.settings.max_step)
@@ -128,22 +127,44 @@ class Screen:
     ) -> FloatArray:
         """Directions (D, n) scaled to the settings' changes of the errors; coordinates in ``held`` are not scaled."""
         settings = self.settings
-        scale = np.ones(len(free))
-        moving = [k for k in range(len(free)) if k not in held]
-        probe = directions.copy()
-        probe[:, moving] *= settings.probe_size
-        points = []
-        for direction, moved in zip(directions, self._moved(config, free, probe), strict=True):
-            limit = settings.max_whitened_change
-            change = np.clip(moved.reshape(-1) - self.white, -limit, limit)
-            unit = settings.probe_size / max(float(np.sqrt(np.mean(change**2))), 1e-3 * settings.probe_size)
-            for size in settings.error_rms_changes:
-                point = direction * scale
-                point[moving] *= size * unit
-                low = np.array([f.coordinate(f.low) for f in free])
-                high = np.array([f.coordinate(f.high) for f in free])
-                points.append(np.clip(point, np.minimum(low, high), np.maximum(low, high)))
-        return np.array(points)
+        moves = np.array([k not in held for k in range(len(free))])
+
+        def scaled(sizes: FloatArray) -> FloatArray:
+            """Each direction at its sizes (D, W), within the bounds: points (D W, n)."""
+            low, high = np.sort([[f.coordinate(v) for v in (f.low, f.high)] for f in free], axis=1).T
+            points = np.where(moves, sizes[:, :, None] * directions[:, None], directions[:, None])
+            return np.asarray(points.clip(low, high).reshape(-1, len(free)))
+
+        probes = np.tile(settings.probe_sizes, (len(directions), 1))
+        moved = self._moved(config, free, scaled(probes))
+        change = np.array([np.sqrt(np.mean(self._change(each) ** 2)) for each in moved])
+        wanted = np.array(settings.error_rms_changes)
+        sizes = [
+            size_of_change(wanted, *each, settings.probe_exponents)
+            for each in zip(probes, change.reshape(probes.shape), strict=True)
+        ]
+        return scaled(np.array(sizes))
+
+    def _change(self, moved: FloatArray) -> FloatArray:
+        """Clipped change (S U 6,) to the whitened errors ``moved`` (S, U, 6)."""
+        limit = self.settings.max_whitened_change
+        return np.asarray(np.clip(moved.reshape(-1) - self.white, -limit, limit))
+
+
+def size_of_change(
+    wanted: FloatArray, sizes: FloatArray, changes: FloatArray, exponents: tuple[float, float]
+) -> FloatArray:
+    """Sizes (W,) that cause the changes ``wanted`` (W,), by power laws between known sizes (K,) and changes (K,).
+
+    Beyond the known sizes the exponent is that of the nearest two, within the bounds ``exponents``.
+    """
+    x = np.log(sizes)
+    y = np.log(np.maximum.accumulate(np.maximum(changes, 1e-6))) + 1e-9 * np.arange(len(x))
+    first, last = np.clip([(y[k + 1] - y[k]) / (x[k + 1] - x[k]) for k in (0, -2)], *exponents)
+    at = np.log(wanted)
+    inside = np.interp(at, y, x)
+    below, above = x[0] + (at - y[0]) / first, x[-1] + (at - y[-1]) / last
+    return np.asarray(np.exp(np.where(at < y[0], below, np.where(at > y[-1], above, inside))))
 
 
 def _grid(free: FitParameter, settings: ScreeningSettings) -> FloatArray:

@@ -19,8 +19,11 @@ class ScreeningSettings:
     """Maximum number of initial points of a candidate's fit."""
     min_start_score_share: float = 0.75
     """A further initial point must have this share of the best screening score."""
-    probe_size: float = 0.03
-    """Size of the probe, in typical sizes, that relates a parameter to a change of the errors."""
+    probe_sizes: tuple[float, ...] = (0.03, 0.3, 3.0)
+    """Sizes [typical sizes] at which the change of the errors is simulated, to find the size of a wanted change. More
+    than one, because some effects grow with the square of their parameter."""
+    probe_exponents: tuple[float, float] = (0.3, 3.0)
+    """Bounds of the exponent with which the change of the errors grows with the size, beyond the probes."""
     max_whitened_change: float = 50.0
     """Changes of whitened errors are clipped here [standard deviations]."""
     batch_size: int = 8

@@ -1,0 +1,60 @@
+"""Withdrawal of effects whose numbers do not differ from their identity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.evidence import ScoredSearch
+from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.identification.measurement_noise import Noise
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
+from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.uncertain_effects import identity_distance, without_uncertain_effects
+from carlab.prediction.windows import cut_windows, segments_of
+from sim_backends import SimulatorConfig
+from sim_backends.car_parameters import MocapParameters
+from tests.helpers.recorded_drives import PERIOD_S, drive
+
+LAG, BRAKE = "steering_lag", "brake_asymmetry"
+CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
+STD = 3e-4 * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
+
+
+@pytest.fixture(scope="module")
+def scored() -> ScoredSearch:
+    """A car with a steering lag, fitted with this lag and with a brake asymmetry that it does not have."""
+    true = replace(CAR, effects={LAG: {"time_constant": 0.05}})
+    windows, held_out = (cut_windows(segments_of([drive(true, 30.0, seed)]), 0.8, 0.5) for seed in (3, 4))
+    problem = SearchProblem(CAR, windows, 3.0 * STD, STD, {})
+    scale = Scale(np.array([8, 16, 24]), np.tile(3.0 * STD, (3, 1)))
+    nothing = problem.fitter(scale).fit(CAR, ())
+    base, best = (refit(problem, effects, nothing, scale).fit for effects in ((), (LAG, BRAKE)))
+    chi2 = dict.fromkeys((LAG, BRAKE), 100.0)
+    found = SearchResult(base, best, (LAG, BRAKE), chi2, {}, ((LAG, best), (BRAKE, best)), (), scale)
+    return ScoredSearch.of(problem, found, HeldOut(held_out, 3.0 * STD, Noise(STD, STD)))
+
+
+def test_effect_that_the_car_does_not_have_is_withdrawn(scored: ScoredSearch) -> None:
+    decisions: list[Decision] = []
+    assert scored.is_joint
+    kept = without_uncertain_effects(scored, RunControl(record=decisions.append))
+    assert kept.found.effects == (LAG,)
+    assert set(kept.fit.config.effects) == {LAG}
+    assert kept.fit.config.effects[LAG]["time_constant"] == pytest.approx(0.05, rel=0.02)
+    assert [(d.effect, d.passed) for d in decisions] == [(LAG, True), (BRAKE, False)]
+
+
+def test_distance_is_in_standard_deviations(scored: ScoredSearch) -> None:
+    assert identity_distance(scored, LAG) > 30.0
+    covariance = scored.fit.covariance
+    assert covariance is not None
+    doubled = replace(scored, fit=replace(scored.fit, covariance=4.0 * covariance))
+    assert identity_distance(doubled, LAG) == pytest.approx(0.5 * identity_distance(scored, LAG))
+
+
+def test_fit_with_estimated_initial_states_decides_nothing(scored: ScoredSearch) -> None:
+    estimated = replace(scored, is_joint=False)
+    assert without_uncertain_effects(estimated, RunControl()) is estimated
