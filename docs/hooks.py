@@ -73,13 +73,18 @@ def _curve(curve: Any) -> str:
     )
 
 
+def _parameter(p: Any) -> str:
+    """A row of the table of an effect's parameters; car files have the words of a choice."""
+    if p.choices:
+        words = [f"`{word}`" for word in p.choices]
+        return f"| `{p.name}` | {p.unit} | {words[0]} | {' or '.join(words)} | {words[0]} |"
+    return f"| `{p.name}` | {p.unit} | {p.same_as or p.identity} | {p.low:g} to {p.high:g} | {p.typical:g} |"
+
+
 def _effect(effect: Any) -> str:
     from sim_backends.effects import confusable_effects, separation
 
-    rows = "\n".join(
-        f"| `{p.name}` | {p.unit} | {p.same_as or p.identity} | {p.low:g} to {p.high:g} | {p.typical:g} |"
-        for p in effect.parameters
-    )
+    rows = "\n".join(_parameter(p) for p in effect.parameters)
     picture = DOCS / "images" / "effects" / f"{effect.id}.png"
     shown = (
         f"![{effect.id}: drive with and without the effect](../images/effects/{effect.id}.png)\n"

@@ -32,6 +32,7 @@ from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_h
 from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.selection.rival_physics import additional_physics
 from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
 from carlab.diagnosis.skill import skill_of
@@ -219,7 +220,8 @@ def _search_effects(
     if request.effects is None:
         scored = without_uncertain_effects(scored, search_control)
     if scored.found.effects != naming.found.effects:
-        naming = replace(naming, found=scored.found, residual=residual_of(problem, scored.found))
+        found, rival = scored.found, additional_physics(problem, scored.found, search_control)
+        naming = replace(naming, found=found, residual=residual_of(problem, found), rival=rival)
     return scored, naming
 
 

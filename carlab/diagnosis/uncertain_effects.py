@@ -18,37 +18,60 @@ from sim_backends.effects import EFFECTS
 
 log = logging.getLogger(__name__)
 
+MIN_VARIANCE = 1e-18
+"""Variance of a coordinate below which it has no influence on the errors: it lies beyond a bound."""
+MIN_OFFSET = 1e-9
+"""Distance of a coordinate from its identity below which it is there."""
+
 
 def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> ScoredSearch:
-    """The search without effects whose numbers do not differ from their identity; unchanged without a joint fit."""
-    if not scored.is_joint:
-        return scored
-    limit = scored.problem.settings.evidence.identity_z_min
-    standing = []
-    for name in scored.found.effects:
-        condition = Condition("evidence.identity_z_min", identity_distance(scored, name), limit)
-        control.record(Decision("stand", name, ((condition,),), condition.holds, len(scored.found.effects)))
-        standing += [name] if condition.holds else []
-    if len(standing) == len(scored.found.effects):
-        return scored
-    log.info("%s: withdrawn (at the identity)", ", ".join(e for e in scored.found.effects if e not in standing))
-    found = restrict(scored.problem, scored.found, tuple(standing), control)
-    return ScoredSearch.of(scored.problem, found, scored.held_out)
+    """The search without effects whose numbers do not differ from their identity; unchanged without a joint fit.
+
+    Effects are removed one by one, the most uncertain first, because two that resemble each other are uncertain only
+    together.
+    """
+    limit = scored.problem.settings.evidence.identity_distance_min
+    while scored.is_joint and scored.found.effects:
+        distances = {name: identity_distance(scored, name) for name in scored.found.effects}
+        weakest = min(distances, key=lambda name: distances[name])
+        stands = distances[weakest] > limit
+        for name in distances if stands else (weakest,):
+            condition = Condition("evidence.identity_distance_min", distances[name], limit)
+            control.record(Decision("stand", name, ((condition,),), stands, len(distances)))
+        if stands:
+            break
+        log.info("%s: withdrawn, because the joint fit does not distinguish it from its identity", weakest)
+        remaining = tuple(name for name in distances if name != weakest)
+        found = restrict(scored.problem, scored.found, remaining, control)
+        scored = ScoredSearch.of(scored.problem, found, scored.held_out)
+    return scored
 
 
 def identity_distance(scored: ScoredSearch, effect: str) -> float:
-    """The largest distance of a number of the effect from its identity, in standard deviations.
+    """Mahalanobis distance of the effect's numbers from their identities, by the covariance of the fit.
 
-    It is infinite if a number has no finite identity.
+    Infinite for an effect with a number without a finite identity, or with a number at the other end of its range.
     """
     numbers = {f"effects.{effect}.{p.name}": p for p in EFFECTS[effect].parameters if not p.choices}
     if any(p.identity is None or math.isinf(p.identity) for p in numbers.values()):
         return math.inf
-    assert scored.fit.covariance is not None
-    std = np.sqrt(np.diag(scored.fit.covariance))
-    fitted = zip(scored.fit.free, scored.fit.z, std, strict=True)
-    own = [abs(float(z)) / max(float(s), 1e-12) for f, z, s in fitted if f.name in numbers]
-    return max(own, default=math.inf)
+    fit = scored.fit
+    assert fit.covariance is not None
+    own, offsets = [], []
+    for k, each in enumerate(fit.free):
+        if each.name not in numbers:
+            continue
+        value = float(each.value(np.array(fit.z[k])))  # the coordinate may lie beyond a bound
+        offset = each.coordinate(value)
+        if fit.covariance[k, k] > MIN_VARIANCE:
+            own.append(k)
+            offsets.append(offset)
+        elif abs(offset) > MIN_OFFSET and value in (each.low, each.high):
+            return math.inf
+    if not own:
+        return 0.0
+    precision = np.linalg.pinv(fit.covariance[np.ix_(own, own)])
+    return float(np.sqrt(np.array(offsets) @ precision @ np.array(offsets)))
 
 
 __all__ = ["identity_distance", "without_uncertain_effects"]

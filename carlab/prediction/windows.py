@@ -171,7 +171,7 @@ def segments_of(episodes: Sequence[EpisodeData], period_s: float | None = None) 
     found = []
     for index, episode in enumerate(episodes):
         if episode.ticks < 2:
-            raise DataError(f"Recording {index + 1} has {episode.ticks} commands; record at least 10 s.")
+            raise DataError(f"Recording {index + 1} has too few commands ({episode.ticks}); record at least 10 s.")
         if period_s is None:
             period_s = episode.period_s * max(int(MAX_PERIOD_S / episode.period_s + 1e-6), 1)
         every = max(round(period_s / episode.period_s), 1)

@@ -126,8 +126,8 @@ def compile_segments(
 
     The input rows are ``parameters`` and ``carried``. The output is a table of segments (``SegmentTable``), with the
     addresses of the rows ``held``, ``step`` and ``time`` at the start, of the block of the first ``body_rows`` carried
-    rows at the start if they are given, and of the block of carried rows at the end. Each operation runs in the outer
-    loop that has its arguments.
+    rows at the start if they are given, and of the block of carried rows at the end. Each operation runs in the
+    outermost loop that has its arguments.
     """
     writer, names = _load_inputs([*parameters, *carried], dtype)
     at_start = [names.pop(node.index) for node in carried]

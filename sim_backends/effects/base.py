@@ -332,7 +332,7 @@ class DynamicsEffect(Effect):
         """Change ``load_front`` and ``load_rear`` by what ``force_x`` and ``front_per_load`` do to them."""
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Change ``side_front`` and ``side_rear``."""
+        """Change ``side_front`` and ``side_rear``; add to ``moment`` what depends on the final ``axle_force``."""
 
     def on_motion(self, ops: Ops, forces: Forces, acceleration_mps2: Value, values: Parameters) -> None:
         """Set rates that depend on dvx/dt [m/s2]."""

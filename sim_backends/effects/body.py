@@ -37,8 +37,8 @@ class YawDamping(DynamicsEffect):
 class TorqueSteer(DynamicsEffect):
     """``M += coefficient u + lever F_x``, u the throttle that acts, F_x the force of the driven axle.
 
-    The first term is the reaction of a motor across the car, the second a drive force beside the centre of mass. F_x is
-    drive less damping, after a traction limit or wheel slip.
+    The first term does not depend on traction. The second is a drive force whose line of action passes the centre of
+    mass at the distance ``lever`` to the right. F_x is drive less damping, after a traction limit or wheel slip.
     """
 
     id = "torque_steer"
@@ -60,9 +60,12 @@ class TorqueSteer(DynamicsEffect):
         return probe.points(probe.sized({"coefficient": c, "lever": m} for c, m in sides))
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Add the moment."""
-        moment = values["coefficient"] * forces.throttle + values["lever"] * forces.axle_force
-        forces.moment = forces.moment + moment
+        """Add the moment of the throttle."""
+        forces.moment = forces.moment + values["coefficient"] * forces.throttle
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Add the moment of the axle force, which load transfer and traction do not change any more."""
+        forces.moment = forces.moment + values["lever"] * forces.axle_force
 
 
 class LateralBias(DynamicsEffect):

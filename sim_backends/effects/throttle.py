@@ -53,8 +53,8 @@ class ThrottleNonlinearity(ActuatorEffect):
     name = "a curved throttle response"
     summary = "The motor's force is not proportional to the throttle command."
     sentence = (
-        "the motor's force is not proportional to the throttle; it follows a curve of the kind "
-        "{curve:choice power|expo} with exponent {exponent}"
+        'the motor\'s force is not proportional to the throttle; it follows the curve "{curve:choice power|expo}" with '
+        "exponent {exponent} (expo: the share of the cubic is half of the exponent less 1)"
     )
     refuted_if = "the curve has a sharp corner (a dead band or a limit) rather than a bend over the whole range"
     command = "throttle"

@@ -139,11 +139,12 @@ class LowFrictionPatch(DynamicsEffect):
 
 
 class FrictionEllipse(DynamicsEffect):
-    """``F_rear = k F``, or ``F_rear = clip(F, -k mu F_z, k mu F_z)`` where ``action`` is "limits"; F is without effect.
+    """``F_rear = k F`` (action "scales") or ``clip(F, -k G, k G)`` (action "limits"), F the side force without it.
 
     ``k = sqrt(1 - clip(scale F_x / (mu F_z), -0.98, 0.98)^2)``: the ellipse scales the side force at every slip angle,
-    or only limits it. F_x is that of the driven axle (drive less damping, after a traction limit or wheel slip).
-    Source: the friction ellipse, Pacejka 2012, "Tire and Vehicle Dynamics", ch. 1.
+    or only limits it. G is the grip ``mu F_z``, or |F| where that is larger (linear tyres). F_x is that of the driven
+    axle (drive less damping, after a traction limit or wheel slip). Source: the friction ellipse, Pacejka 2012, "Tire
+    and Vehicle Dynamics", ch. 1.
     """
 
     id = "friction_ellipse"
@@ -151,8 +152,8 @@ class FrictionEllipse(DynamicsEffect):
     name = "grip shared between driving and cornering"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (
-        "driving and braking take side force from rear tyres: a friction circle at {scale} times the drive force "
-        "{action:choice scales|limits} it"
+        "driving and braking take side force from the rear tyres: a friction ellipse with {scale} times the drive "
+        "force {action:choice scales|limits} it"
     )
     refuted_if = (
         "driving and braking change the handling balance in opposite directions (then load moves between axles)"
@@ -177,9 +178,10 @@ class FrictionEllipse(DynamicsEffect):
         """Scale or limit the rear's side force."""
         peak = ops.at_least(forces.grip_rear * forces.load_rear, 1e-6)
         share = ops.clip(values["scale"] * forces.axle_force / peak, -MAX_SHARE, MAX_SHARE)
-        left = ops.sqrt(1.0 - share * share)
-        limited = ops.clip(forces.side_rear, -left * peak, left * peak)
-        forces.side_rear = ops.where(values["action"] < 0.5, left * forces.side_rear, limited)
+        remaining = ops.sqrt(1.0 - share * share)
+        limit = remaining * ops.at_least(ops.abs(forces.side_rear), peak)
+        limited = ops.clip(forces.side_rear, -limit, limit)
+        forces.side_rear = ops.where(values["action"] < 0.5, remaining * forces.side_rear, limited)
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
         """Both actions at several scales."""

@@ -27,6 +27,19 @@ def test_size_of_a_threshold_lies_above_the_sizes_without_a_change() -> None:
     assert 0.3 < found < 3.0
 
 
+def test_size_is_finite_for_effects_without_a_change_and_for_equal_sizes_at_a_bound() -> None:
+    for sizes, changes in (([0.03, 0.3, 3.0], [0.0, 0.0, 0.0]), ([0.03, 0.3, 0.3], [0.02, 0.2, 0.2])):
+        found = size_of_change(np.array(WANTED), np.array(sizes), np.array(changes), EXPONENTS)
+        assert np.isfinite(found).all()
+        assert (np.diff(found) >= 0.0).all()
+
+
+def test_size_of_falling_changes_is_that_of_the_first_larger_change() -> None:
+    """A simulation that diverges is clipped, so a larger size may change the errors less."""
+    [found] = size_of_change(np.array([0.2]), np.array([0.03, 0.3, 3.0]), np.array([0.02, 0.2, 0.1]), EXPONENTS)
+    assert found == pytest.approx(0.3)
+
+
 @pytest.fixture(scope="module")
 def screen() -> Screen:
     car = SimulatorConfig(control_period_s=PERIOD_S)

@@ -7,7 +7,8 @@ import pytest
 
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import ScoredSearch
-from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.fit import Fit, Scale
+from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
@@ -44,7 +45,7 @@ def test_effect_that_the_car_does_not_have_is_withdrawn(scored: ScoredSearch) ->
     assert kept.found.effects == (LAG,)
     assert set(kept.fit.config.effects) == {LAG}
     assert kept.fit.config.effects[LAG]["time_constant"] == pytest.approx(0.05, rel=0.02)
-    assert [(d.effect, d.passed) for d in decisions] == [(LAG, True), (BRAKE, False)]
+    assert [(d.effect, d.passed) for d in decisions] == [(BRAKE, False), (LAG, True)]
 
 
 def test_distance_is_in_standard_deviations(scored: ScoredSearch) -> None:
@@ -53,6 +54,32 @@ def test_distance_is_in_standard_deviations(scored: ScoredSearch) -> None:
     assert covariance is not None
     doubled = replace(scored, fit=replace(scored.fit, covariance=4.0 * covariance))
     assert identity_distance(doubled, LAG) == pytest.approx(0.5 * identity_distance(scored, LAG))
+
+
+def with_values(scored: ScoredSearch, effect: str, z: float, variance: float) -> ScoredSearch:
+    """The search with another coordinate and variance of an effect's first number."""
+    k = next(k for k, f in enumerate(scored.fit.free) if f.name.startswith(f"effects.{effect}."))
+    assert scored.fit.covariance is not None
+    covariance, coordinates = scored.fit.covariance.copy(), scored.fit.z.copy()
+    covariance[k, :] = covariance[:, k] = 0.0
+    covariance[k, k], coordinates[k] = variance, z
+    return replace(scored, fit=replace(scored.fit, z=coordinates, covariance=covariance))
+
+
+@pytest.mark.parametrize(("z", "expected"), [(-0.4, 0.0), (1e3, np.inf)])
+def test_number_beyond_a_bound_is_at_that_bound(scored: ScoredSearch, z: float, expected: float) -> None:
+    """The errors do not depend on a coordinate beyond a bound, so its variance is 0. A lag of 0 is no effect."""
+    assert identity_distance(with_values(scored, LAG, z, 0.0), LAG) == expected
+
+
+def test_distance_of_two_numbers_uses_their_correlation() -> None:
+    """Sum and difference of both are known to 1 and 0.1; the difference is 1 away from the identity."""
+    free = effect_parameters("torque_steer", CAR)
+    covariance = 0.25 * np.array([[1.0 + 0.01, 1.0 - 0.01], [1.0 - 0.01, 1.0 + 0.01]])
+    fit = Fit(CAR, free, np.array([0.5, -0.5]), 0.0, np.zeros(1), covariance)
+    found = identity_distance(ScoredSearch(None, None, None, fit, {}, True), "torque_steer")  # type: ignore[arg-type]
+    assert found == pytest.approx(10.0)
+    assert identity_distance(ScoredSearch(None, None, None, fit, {}, True), "steering_rate_limit") == np.inf  # type: ignore[arg-type]
 
 
 def test_fit_with_estimated_initial_states_decides_nothing(scored: ScoredSearch) -> None:

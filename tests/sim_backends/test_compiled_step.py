@@ -51,6 +51,28 @@ def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_
         assert torch.allclose(compiled, reference, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-4), (torch.float64, 1e-9)])
+@pytest.mark.parametrize("cars", [1, 5, 37])
+def test_hidden_states_before_the_start_equal_those_of_torch_operators(cars, dtype, tolerance):
+    """Effects with hidden states of the body follow the recorded states of the history, with a delay for each car."""
+    names = ("tyre_relaxation", "longitudinal_slip", "roll_dynamics", "motor_lag")
+    config = SimulatorConfig(effects={name: ALL_EFFECTS[name] for name in names})
+    start, commands = (v.to(dtype) for v in some(cars, 16))
+    states = torch.tensor(np.random.default_rng(2).uniform(0.5, 2.0, (cars, 12, 6)), dtype=dtype)
+    delay = torch.linspace(0.02, 0.09, cars, dtype=dtype)
+    results = []
+    for engine, needs_gradient in (("operators", True), ("fastest", True), ("fastest", False)):
+        mu = torch.full((cars,), 0.5, dtype=dtype, requires_grad=needs_gradient)
+        out = rollout(
+            config, start, commands[:, 12:], history=commands[:, :12], history_states=states, max_step_s=0.02,
+            values={"timing.command_delay": delay, "tyre.front.mu": mu}, engine=engine,
+        )  # fmt: skip
+        results.append(out.states.detach())
+    assert not torch.allclose(results[0], rollout(config, start, commands[:, 12:]).states, rtol=1e-2)
+    for found in results[1:]:
+        assert torch.allclose(found, results[0], rtol=tolerance, atol=tolerance)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_car_has_the_same_states_and_gradients_in_a_batch_of_any_size(dtype):
     """The last vector of a batch overlaps the one before it; batches shorter than a vector are padded."""

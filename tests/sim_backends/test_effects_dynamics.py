@@ -41,6 +41,11 @@ CASES = {
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
     "limited_ellipse": {"friction_ellipse": {"scale": 0.9, "action": "limits"}},
     "lever_with_traction": {"torque_steer": {"lever": -0.02}, "traction_limit": {"share": 0.6}},
+    "lever_with_traction_and_transfer": {
+        "torque_steer": {"lever": -0.02},
+        "traction_limit": {"share": 0.6},
+        "load_transfer": {"height": 0.06},
+    },
     "slow_roll": {"roll_dynamics": {"frequency": 1.2, "damping": 0.2}},
     "soft_roll": {"roll_dynamics": {"frequency": 2.0, "damping": 0.4, "sensitivity": 2.5}},
     "long_relaxation": {"tyre_relaxation": {"length": 0.6}},
@@ -202,9 +207,9 @@ def reference_rates(t, s, d, u, p, e):
         rim_rate = RADIUS**2 / q["inertia"] * (demand - force)
     if has("friction_ellipse"):
         q, peak = e["friction_ellipse"], mu_rear * z_rear
-        left = math.cos(math.asin(min(max(q["scale"] * force / peak, -0.98), 0.98)))
-        sharp = math.copysign(min(abs(f_rear), left * peak), f_rear)
-        f_rear = sharp if q.get("action") == "limits" else left * f_rear
+        kept = math.cos(math.asin(min(max(q["scale"] * force / peak, -0.98), 0.98)))
+        sharp = math.copysign(min(abs(f_rear), kept * peak), f_rear)
+        f_rear = sharp if q.get("action") == "limits" else kept * f_rear
     if has("torque_steer"):
         moment += np.dot([e["torque_steer"].get(name, 0.0) for name in ("coefficient", "lever")], [u, force])
     roll_acc = 0.0

@@ -135,6 +135,22 @@ def test_effect_at_its_identity_changes_nothing_for_other_model_kinds(name, kind
     assert (plain.measured - same.measured).abs().max() <= 1e-12
 
 
+CHOICES = [
+    (name, p.name, word)
+    for name in NAMES
+    for p in EFFECTS[name].parameters
+    for word in p.choices[1:]
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "choice", "word"), CHOICES)
+@pytest.mark.parametrize("kind", ["dynamic", "kinematic", "linear_tyre", "blend"])
+def test_identity_of_the_numbers_holds_for_each_choice(name, choice, word, kind):
+    plain = without_effects(kind)
+    same = rollout(SimulatorConfig(kind=kind, effects={name: {choice: word}}), *some(), measured=True)
+    assert (plain.states - same.states).abs().max() <= 1e-12
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
 def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeypatch):

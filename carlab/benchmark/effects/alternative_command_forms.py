@@ -134,7 +134,7 @@ def two_lags(world: World, p: Parameters) -> None:
 
 
 def throttle_curve(world: World, p: Parameters) -> None:
-    """A speed controller with an exponential curve."""
+    """A speed controller with the exponential curve ``u = sign(u_t) expm1(bend |u_t|) / expm1(bend)``."""
     bend = max(p["bend"], 1e-9)
     world.throttle_maps.append(lambda u: math.copysign(math.expm1(bend * abs(u)) / math.expm1(bend), u))
 

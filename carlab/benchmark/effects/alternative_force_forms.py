@@ -110,7 +110,11 @@ def brush_tyre(world: World, p: Parameters) -> None:
 
 
 def combined_slip(world: World, p: Parameters) -> None:
-    """The weighting function cos(atan(k)) of the magic formula for combined slip (Pacejka, section 4.3.2)."""
+    """Side force times cos(atan(k)), k = scale F_x / (mu F_z).
+
+    This is the form of the magic formula's weighting function for combined slip (Pacejka 2012, "Tire and Vehicle
+    Dynamics", section 4.3.2), with force in place of slip.
+    """
     scale = p["scale"]
 
     def weigh(now: Instant) -> None:
@@ -210,7 +214,7 @@ def viscous_yaw(world: World, p: Parameters) -> None:
 
 
 def torque_by_force(world: World, p: Parameters) -> None:
-    """The axle force acts beside the centre of mass; its lever grows with it, as the suspension yields."""
+    """The line of action of the axle force misses the centre of mass; the lever grows with the force."""
     c, gain = p["coefficient"], world.car.drive_gain
 
     def pull(now: Instant) -> None:

@@ -136,12 +136,15 @@ class Screen:
             return np.asarray(points.clip(low, high).reshape(-1, len(free)))
 
         probes = np.tile(settings.probe_sizes, (len(directions), 1))
-        moved = self._moved(config, free, scaled(probes))
+        points = scaled(probes)
+        moved = self._moved(config, free, points)
         change = np.array([np.sqrt(np.mean(self._change(each) ** 2)) for each in moved])
         wanted = np.array(settings.error_rms_changes)
+        along = np.where(moves & (directions != 0.0), directions, np.inf)[:, None]
+        reached = np.abs(points.reshape(*probes.shape, -1) / along).max(axis=2)
         sizes = [
             size_of_change(wanted, *each, settings.probe_exponents)
-            for each in zip(probes, change.reshape(probes.shape), strict=True)
+            for each in zip(reached, change.reshape(probes.shape), strict=True)
         ]
         return scaled(np.array(sizes))
 
@@ -156,10 +159,12 @@ def size_of_change(
 ) -> FloatArray:
     """Sizes (W,) that cause the changes ``wanted`` (W,), by power laws between known sizes (K,) and changes (K,).
 
-    Beyond the known sizes the exponent is that of the nearest two, within the bounds ``exponents``.
+    Beyond the known sizes the exponent is that of the nearest two, within the bounds ``exponents``. Sizes may be equal
+    at a bound of a parameter; changes are taken as not decreasing.
     """
-    x = np.log(sizes)
-    y = np.log(np.maximum.accumulate(np.maximum(changes, 1e-6))) + 1e-9 * np.arange(len(x))
+    order = 1e-9 * np.arange(len(sizes))
+    x = np.log(np.maximum(sizes, 1e-9)) + order
+    y = np.log(np.maximum.accumulate(np.maximum(changes, 1e-6))) + order
     first, last = np.clip([(y[k + 1] - y[k]) / (x[k + 1] - x[k]) for k in (0, -2)], *exponents)
     at = np.log(wanted)
     inside = np.interp(at, y, x)
@@ -214,4 +219,4 @@ def screen_candidates(
     return tuple(sorted((each for each in scored if each is not None), key=lambda result: -result.score))
 
 
-__all__ = ["Screen", "ScreeningResult", "screen_candidates"]
+__all__ = ["Screen", "ScreeningResult", "screen_candidates", "size_of_change"]

@@ -25,9 +25,9 @@ class EvidenceSettings:
     joint_min_relative_std: float = 0.002
     """The same for joint fits of parameters and initial states, whose errors are a third as large
     (docs/decisions/0023)."""
-    identity_z_min: float = 1.6449
-    """An effect is withdrawn if none of its numbers, in a joint fit, differs from its identity by this many standard
-    deviations: the 90 % interval then contains no effect."""
+    identity_distance_min: float = 1.6449
+    """An effect is withdrawn if its numbers in a joint fit differ from their identities by less than this many standard
+    deviations (Mahalanobis distance, without ``joint_interval_factor``). An infinite identity has no distance."""
     unexplained_score_min: float = 1.2
     """Refit score (noise floors) above which unnamed terms count as missing physics."""
     unexplained_score_min_without_term: float = 1.8

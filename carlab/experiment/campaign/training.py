@@ -365,6 +365,7 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
         (unfinished / FIGURES_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
         os.replace(unfinished, folder)
     except OSError as error:
+        shutil.rmtree(unfinished, ignore_errors=True)  # unfinished files would keep the disk full
         raise DataError(describe_os_error(error, folder)) from error
 
 
