@@ -253,6 +253,7 @@ class SingleTrack:
             load_rear=self.rear_load,
             grip_front=self.front_mu,
             grip_rear=self.rear_mu,
+            full_drive=self.drive_gain,
             drive=drive,
             states=dict(zip(self.extra_states, state[6:], strict=False)),
             stiff=stiff,

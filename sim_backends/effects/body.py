@@ -35,37 +35,36 @@ class YawDamping(DynamicsEffect):
 
 
 class TorqueSteer(DynamicsEffect):
-    """``M += coefficient u + lever F_x``, u the throttle that acts, F_x the force of the driven axle.
+    """``M += coefficient u``, or ``M += coefficient F_x / F_full`` where ``source`` is "force".
 
-    The first term does not depend on traction. The second is a drive force whose line of action passes the centre of
-    mass at the distance ``lever`` to the right. F_x is drive less damping, after a traction limit or wheel slip.
+    u is the throttle that acts, F_x the force of the driven axle (drive less damping, after a traction limit or wheel
+    slip), F_full the motor's force at full throttle. A drive force that misses the centre of mass has the second form.
     """
 
     id = "torque_steer"
     name = "torque steer"
     summary = "Torque steer: a yaw moment proportional to the throttle or to the force of the driven axle."
     sentence = (
-        "driving turns the car, with a moment of {coefficient} times the throttle plus {lever} times the force of the "
-        "driven axle (positive: to the left)"
+        "full throttle at a standstill turns the car to the {coefficient:left|right} with a moment of "
+        "{coefficient:size}, which changes with the {source:choice throttle|force of the driven axle}"
     )
     refuted_if = "the car also pulls to that side when it rolls without throttle"
     parameters = (
         EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),
-        EffectParameter("lever", "m", 0.0, -1.0, 1.0, 0.01),
+        EffectParameter("source", "1", 0.0, 0.0, 1.0, 0.0, choices=("throttle", "force")),
     )
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
-        """Each term alone, with both signs."""
-        sides = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
-        return probe.points(probe.sized({"coefficient": c, "lever": m} for c, m in sides))
-
-    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Add the moment of the throttle."""
-        forces.moment = forces.moment + values["coefficient"] * forces.throttle
+        """Both sources with both signs."""
+        both = ({"coefficient": sign, "source": float(k)} for k in range(2) for sign in (1.0, -1.0))
+        return probe.points(probe.sized(both, held=("source",)))
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Add the moment of the axle force, which load transfer and traction do not change any more."""
-        forces.moment = forces.moment + values["lever"] * forces.axle_force
+        """Add the moment; load transfer and traction do not change the axle force any more."""
+        share = ops.where(
+            values["source"] < 0.5, forces.throttle, forces.axle_force / ops.at_least(forces.full_drive, 1e-9)
+        )
+        forces.moment = forces.moment + values["coefficient"] * share
 
 
 class LateralBias(DynamicsEffect):

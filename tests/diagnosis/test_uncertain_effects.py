@@ -74,10 +74,10 @@ def test_number_beyond_a_bound_is_at_that_bound(scored: ScoredSearch, z: float, 
 
 def test_distance_of_two_numbers_uses_their_correlation() -> None:
     """Sum and difference of both are known to 1 and 0.1; the difference is 1 away from the identity."""
-    free = effect_parameters("torque_steer", CAR)
+    free = effect_parameters("marker_offset", CAR)
     covariance = 0.25 * np.array([[1.0 + 0.01, 1.0 - 0.01], [1.0 - 0.01, 1.0 + 0.01]])
     fit = Fit(CAR, free, np.array([0.5, -0.5]), 0.0, np.zeros(1), covariance)
-    found = identity_distance(ScoredSearch(None, None, None, fit, {}, True), "torque_steer")  # type: ignore[arg-type]
+    found = identity_distance(ScoredSearch(None, None, None, fit, {}, True), "marker_offset")  # type: ignore[arg-type]
     assert found == pytest.approx(10.0)
     assert identity_distance(ScoredSearch(None, None, None, fit, {}, True), "steering_rate_limit") == np.inf  # type: ignore[arg-type]
 

@@ -40,9 +40,12 @@ CASES = {
     "traction_limit_all": {"traction_limit": {"share": 0.5, "axle": "all"}},
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
     "limited_ellipse": {"friction_ellipse": {"scale": 0.9, "action": "limits"}},
-    "lever_with_traction": {"torque_steer": {"lever": -0.02}, "traction_limit": {"share": 0.6}},
-    "lever_with_traction_and_transfer": {
-        "torque_steer": {"lever": -0.02},
+    "torque_with_traction": {
+        "torque_steer": {"coefficient": -0.1, "source": "force"},
+        "traction_limit": {"share": 0.6},
+    },
+    "torque_with_traction_and_transfer": {
+        "torque_steer": {"coefficient": -0.1, "source": "force"},
         "traction_limit": {"share": 0.6},
         "load_transfer": {"height": 0.06},
     },
@@ -211,7 +214,8 @@ def reference_rates(t, s, d, u, p, e):
         sharp = math.copysign(min(abs(f_rear), kept * peak), f_rear)
         f_rear = sharp if q.get("action") == "limits" else kept * f_rear
     if has("torque_steer"):
-        moment += np.dot([e["torque_steer"].get(name, 0.0) for name in ("coefficient", "lever")], [u, force])
+        q = e["torque_steer"]
+        moment += q["coefficient"] * (force / p.drive_gain_n if q.get("source") == "force" else u)
     roll_acc = 0.0
     if has("roll_dynamics"):
         q = e["roll_dynamics"]

@@ -254,7 +254,7 @@ def test_choice_is_a_word_in_car_files_and_a_position_elsewhere():
 MIRRORED = {
     "steering_offset": ("angle",),
     "steering_asymmetry": ("gain",),
-    "torque_steer": ("coefficient", "lever"),
+    "torque_steer": ("coefficient",),
     "lateral_bias": ("force",),
     "low_friction_patch": ("y",),
     "road_slope": ("direction",),
