@@ -26,13 +26,18 @@ from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, FigureData,
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
-from carlab.diagnosis.naming import NamingResult, accept_names, describe_unexplained, residual_of
+from carlab.diagnosis.naming import (
+    NamingResult,
+    accept_names,
+    describe_unexplained,
+    residual_of,
+    with_fewer_effects,
+)
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
-from carlab.diagnosis.selection.rival_physics import additional_physics
 from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
 from carlab.diagnosis.skill import skill_of
@@ -219,9 +224,8 @@ def _search_effects(
     scored = ScoredSearch.of(problem, naming.found, held_out)
     if request.effects is None:
         scored = without_uncertain_effects(scored, search_control)
-    if scored.found.effects != naming.found.effects:
-        found, rival = scored.found, additional_physics(problem, scored.found, search_control)
-        naming = replace(naming, found=found, residual=residual_of(problem, found), rival=rival)
+        if scored.found.effects != naming.found.effects:
+            naming = with_fewer_effects(problem, naming, scored.found, search_control)
     return scored, naming
 
 

@@ -9,7 +9,7 @@ negligible, or if they increase that error when they are added last (``weak_effe
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -85,6 +85,17 @@ def accept_names(
         residual = residual_of(problem, found)
         rival = _rival_without_names(problem, found, rival, control)
     return NamingResult(found, residual, rival, vibration)
+
+
+def with_fewer_effects(
+    problem: SearchProblem, naming: NamingResult, found: SearchResult, control: RunControl
+) -> NamingResult:
+    """The naming after effects were withdrawn from its search: residual and rival physics are fitted again."""
+    if found.effects:
+        rival = additional_physics(problem, found, control)
+    else:
+        rival = _rival_without_names(problem, found, naming.rival, control)
+    return replace(naming, found=found, residual=residual_of(problem, found), rival=rival)
 
 
 def _rival_without_names(

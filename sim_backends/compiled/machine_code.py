@@ -134,9 +134,9 @@ def compile_segments(
     at_segment = [writer.variable() for _ in carried]
     at_step = [writer.variable() for _ in (time, *carried)]
     before, writer.lines = writer.lines, []
-    (steps, for_measurement, has_start), (*rows, given_start, end) = _segment_columns(writer)
+    (steps, for_measurement, has_start), (*rows, start, end) = _segment_columns(writer)
     names |= {node.index: _load_row(writer, row) for node, row in zip((step, time, *held), rows, strict=True)}
-    first_step = _start_of_segment(writer, given_start, has_start, at_segment, body_rows)
+    first_step = _start_of_segment(writer, start, has_start, at_segment, body_rows)
     start_time, segment = names[time.index], writer.lines
     names |= {node.index: name for node, name in zip((time, *carried), at_step, strict=True)}
     depths = {node.index: 1 for node in (step, *held)} | {node.index: 2 for node in (time, *carried)}
@@ -208,11 +208,11 @@ def _write_by_depth(
 
 
 def _start_of_segment(
-    writer: VectorWriter, block: Name, has_start: Name, carried: Sequence[Name], body: int
+    writer: VectorWriter, block: Name, has_start: Name, carried: Sequence[Name], body_rows: int
 ) -> list[Name]:
-    """The carried values, of which the first ``body`` are those of the block if the segment has a start."""
-    given = [_load_row(writer, _row_of_block(writer, block, k)) for k in range(body)]
-    return [*_selected(writer, has_start, given, carried[:body]), *carried[body:]]
+    """The carried values, of which the first ``body_rows`` are those of the block if the segment has a start."""
+    body = [_load_row(writer, _row_of_block(writer, block, k)) for k in range(body_rows)]
+    return [*_selected(writer, has_start, body, carried[:body_rows]), *carried[body_rows:]]
 
 
 def _end_of_segment(

@@ -46,7 +46,7 @@ class TorqueSteer(DynamicsEffect):
     summary = "Torque steer: a yaw moment proportional to the throttle or to the force of the driven axle."
     sentence = (
         "full throttle at a standstill turns the car to the {coefficient:left|right} with a moment of "
-        "{coefficient:size}, which changes with the {source:choice throttle|force of the driven axle}"
+        "{coefficient:size}, in proportion to the {source:choice throttle|force of the driven axle}"
     )
     refuted_if = "the car also pulls to that side when it rolls without throttle"
     parameters = (
@@ -56,8 +56,8 @@ class TorqueSteer(DynamicsEffect):
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
         """Both sources with both signs."""
-        both = ({"coefficient": sign, "source": float(k)} for k in range(2) for sign in (1.0, -1.0))
-        return probe.points(probe.sized(both, held=("source",)))
+        directions = ({"coefficient": sign, "source": float(k)} for k in range(2) for sign in (1.0, -1.0))
+        return probe.points(probe.sized(directions, held=("source",)))
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add the moment; load transfer and traction do not change the axle force any more."""

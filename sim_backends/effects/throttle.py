@@ -11,7 +11,7 @@ from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParamete
 
 _MIN_THROTTLE = 1e-12
 _CUBIC_SHARES = (0.0, 1.0)
-"""Shares of the cubic term of an "expo" curve: less than 0 would be a saturation, above 1 the curve falls around 0."""
+"""Shares of the cubic term of an "expo" curve: a negative one is a saturation, one above 1 reverses small commands."""
 
 
 class ThrottleDeadband(ActuatorEffect):
@@ -53,8 +53,8 @@ class ThrottleNonlinearity(ActuatorEffect):
     name = "a curved throttle response"
     summary = "The motor's force is not proportional to the throttle command."
     sentence = (
-        'the motor\'s force is not proportional to the throttle; it follows the curve "{curve:choice power|expo}" with '
-        "exponent {exponent} (expo: the share of the cubic is half of the exponent less 1)"
+        "the motor's force is not proportional to the throttle; it follows the {curve:choice power|expo} curve with "
+        "exponent {exponent} (an expo curve with exponent n has a cubic share of (n - 1) / 2)"
     )
     refuted_if = "the curve has a sharp corner (a dead band or a limit) rather than a bend over the whole range"
     command = "throttle"

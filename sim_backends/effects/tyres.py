@@ -152,8 +152,8 @@ class FrictionEllipse(DynamicsEffect):
     name = "grip shared between driving and cornering"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (
-        "driving and braking take side force from the rear tyres: a friction ellipse with {scale} times the drive "
-        "force {action:choice scales|limits} it"
+        "driving and braking reduce the grip for cornering: a friction ellipse with {scale} times the drive "
+        "force {action:choice scales|limits} the side force of the rear tyres"
     )
     refuted_if = (
         "driving and braking change the handling balance in opposite directions (then load moves between axles)"
@@ -185,8 +185,8 @@ class FrictionEllipse(DynamicsEffect):
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
         """Both actions at several scales."""
-        both = ({"scale": 1.0, "action": float(k)} for k in range(2))
-        return probe.points(probe.sized(both, held=("action",)))
+        directions = ({"scale": 1.0, "action": float(k)} for k in range(2))
+        return probe.points(probe.sized(directions, held=("action",)))
 
 
 class TyreRelaxation(DynamicsEffect):

@@ -41,10 +41,10 @@ def scored() -> ScoredSearch:
 def test_effect_that_the_car_does_not_have_is_withdrawn(scored: ScoredSearch) -> None:
     decisions: list[Decision] = []
     assert scored.is_joint
-    kept = without_uncertain_effects(scored, RunControl(record=decisions.append))
-    assert kept.found.effects == (LAG,)
-    assert set(kept.fit.config.effects) == {LAG}
-    assert kept.fit.config.effects[LAG]["time_constant"] == pytest.approx(0.05, rel=0.02)
+    confirmed = without_uncertain_effects(scored, RunControl(record=decisions.append))
+    assert confirmed.found.effects == (LAG,)
+    assert set(confirmed.fit.config.effects) == {LAG}
+    assert confirmed.fit.config.effects[LAG]["time_constant"] == pytest.approx(0.05, rel=0.02)
     assert [(d.effect, d.passed) for d in decisions] == [(BRAKE, False), (LAG, True)]
 
 
@@ -52,8 +52,8 @@ def test_distance_is_in_standard_deviations(scored: ScoredSearch) -> None:
     assert identity_distance(scored, LAG) > 30.0
     covariance = scored.fit.covariance
     assert covariance is not None
-    doubled = replace(scored, fit=replace(scored.fit, covariance=4.0 * covariance))
-    assert identity_distance(doubled, LAG) == pytest.approx(0.5 * identity_distance(scored, LAG))
+    with_double_std = replace(scored, fit=replace(scored.fit, covariance=4.0 * covariance))
+    assert identity_distance(with_double_std, LAG) == pytest.approx(0.5 * identity_distance(scored, LAG))
 
 
 def with_values(scored: ScoredSearch, effect: str, z: float, variance: float) -> ScoredSearch:

@@ -210,9 +210,9 @@ def reference_rates(t, s, d, u, p, e):
         rim_rate = RADIUS**2 / q["inertia"] * (demand - force)
     if has("friction_ellipse"):
         q, peak = e["friction_ellipse"], mu_rear * z_rear
-        kept = math.cos(math.asin(min(max(q["scale"] * force / peak, -0.98), 0.98)))
-        sharp = math.copysign(min(abs(f_rear), kept * peak), f_rear)
-        f_rear = sharp if q.get("action") == "limits" else kept * f_rear
+        side_share = math.cos(math.asin(min(max(q["scale"] * force / peak, -0.98), 0.98)))
+        limited = math.copysign(min(abs(f_rear), side_share * peak), f_rear)
+        f_rear = limited if q.get("action") == "limits" else side_share * f_rear
     if has("torque_steer"):
         q = e["torque_steer"]
         moment += q["coefficient"] * (force / p.drive_gain_n if q.get("source") == "force" else u)

@@ -1,4 +1,4 @@
-"""Test properties of each effect: identity, engines, gradients, files, symmetries, hidden states."""
+"""Test properties of each effect: identity, engines, gradients, files, symmetries."""
 
 import functools
 import math
@@ -9,14 +9,14 @@ import pytest
 import tomli_w
 import torch
 
-from carlab.core.errors import ConfigError, DataError
+from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, CarState
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS, MeasuredCurve
 from sim_backends.plant import Plant
+from tests.helpers.effect_inputs import NAMES, past, some, typical
 
-NAMES = list(EFFECTS)
 IDS = [
     "command_delay",
     "steering_delay",
@@ -56,24 +56,6 @@ IDS = [
     "mocap_yaw_misalignment",
     "velocity_filter_lag",
 ]
-
-
-def typical(name):
-    numbers = {p.name: p.typical for p in EFFECTS[name].parameters}
-    stronger = {"battery_sag": {"rate": 0.2}, "friction_drift": {"rate": -0.2}}
-    # These delays do not coincide with changes of the number of steps.
-    stronger |= {"steering_delay": {"delay": 0.0273}, "throttle_delay": {"delay": 0.0214}}
-    return {**numbers, **stronger.get(name, {})}
-
-
-def some(cars=4, ticks=6, seed=0):
-    rng = np.random.default_rng(seed)
-    start = rng.uniform(-1, 1, (cars, 6)) * [1, 1, 3, 1, 0.3, 1] + [0.5, 0, 0, 1.6, 0, 0]
-    return torch.tensor(start), torch.tensor(rng.uniform(-1, 1, (cars, ticks, 2)))
-
-
-def past(cars=4, ticks=5):
-    return torch.tensor(np.random.default_rng(5).uniform(-1, 1, (cars, ticks, 2)))
 
 
 def test_catalogue_is_complete():
@@ -313,90 +295,3 @@ def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
     image = rollout(SimulatorConfig(effects={name: moved_parameters}), transformed(start), commands, measured=True)
     assert torch.allclose(transformed(original.states), image.states, rtol=0, atol=1e-10)
     assert torch.allclose(transformed(original.measured), image.measured, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_rollout_with_history_continues_a_longer_rollout(name):
-    """The history determines the hidden states, ``t0_s`` the time."""
-    config = SimulatorConfig(effects={name: typical(name)})
-    generator = np.random.default_rng(8)
-    start = torch.tensor([[0, 0, 0, 2.0, 0, 0], [1, 0, 1, 1.5, 0, 0]], dtype=torch.float64)
-    commands = torch.tensor(generator.uniform([-0.6, 0.1], [0.6, 0.6], (2, 45, 2)))
-    full = rollout(config, start, commands).states
-    half = rollout(
-        config,
-        full[:, 30],
-        commands[:, 30:],
-        history=commands[:, :30],
-        history_states=full[:, :30],
-        t0_s=30 * config.control_period_s,
-    ).states
-    assert torch.allclose(half, full[:, 30:], rtol=0, atol=2e-3)
-    if not {"states", "has_state"} & {k for k in dir(EFFECTS[name]) if getattr(EFFECTS[name], k)}:
-        assert torch.allclose(half, full[:, 30:], rtol=0, atol=1e-9)
-
-
-def test_hidden_states_without_history_are_steady_for_the_initial_velocities():
-    """On a steady circle the steady-state hidden states are exact, so a restarted rollout is unchanged."""
-    effects = {n: typical(n) for n in ("tyre_relaxation", "roll_dynamics", "longitudinal_slip", "steering_lag")}
-    config = SimulatorConfig(effects=effects)
-    start = torch.tensor([[0, 0, 0, 1.2, 0, 0]], dtype=torch.float64)
-    commands = torch.tensor([0.25, 0.3], dtype=torch.float64).expand(1, 400, 2)
-    full = rollout(config, start, commands).states
-    restarted = rollout(config, full[:, 360], commands[:, 360:], history=commands[:, :20]).states
-    assert torch.allclose(restarted, full[:, 360:], rtol=0, atol=1e-4)
-
-
-def test_time_dependent_effects_use_the_time_since_the_first_row():
-    start, commands = some(cars=1)
-    for name, rate in (("battery_sag", 0.01), ("friction_drift", -0.01)):
-        config = SimulatorConfig(effects={name: {"rate": rate}})
-        late = rollout(config, start, commands, t0_s=30.0).states
-        scale = (
-            {"motor.drive_gain": 8.2 * 0.7}
-            if name == "battery_sag"
-            else {"tyre.front.mu": 0.43 * 0.7, "tyre.rear.mu": 0.42 * 0.7}
-        )
-        about = rollout(SimulatorConfig().with_values(scale), start, commands).states
-        early = rollout(config, start, commands).states
-        assert (late - about).abs().max() < 0.1 * (early - about).abs().max()
-    shifted = rollout(config, start, commands, t0_s=torch.tensor(30.0, dtype=torch.float64)).states
-    assert torch.equal(shifted, late)
-    with pytest.raises(DataError, match="t0_s"):
-        rollout(config, start, commands, t0_s=torch.zeros(3))
-    with pytest.raises(DataError, match="history_states"):
-        rollout(config, start, commands, history=past(1), history_states=torch.zeros(1, 3, 6))
-
-
-def test_result_does_not_depend_on_the_listed_order_of_effects():
-    """All effects together give finite states from standstill and in reverse."""
-    all_effects = {n: typical(n) for n in NAMES}
-    backwards = dict(reversed(all_effects.items()))
-    start, commands = some()
-    start[0], start[1, 3] = 0.0, -1.5
-    one, other = (rollout(SimulatorConfig(effects=e), start, commands, measured=True) for e in (all_effects, backwards))
-    assert torch.allclose(one.states, other.states, rtol=0, atol=1e-9)
-    assert torch.allclose(one.measured, other.measured, rtol=0, atol=1e-9)
-    assert torch.isfinite(one.measured).all()
-
-
-def test_yaw_misalignment_changes_only_measured_states():
-    angle = 0.05
-    start, commands = some()
-    config = SimulatorConfig(
-        effects={"mocap_latency": {"latency": 0.0}, "mocap_yaw_misalignment": {"angle": angle}, "marker_offset": {}}
-    )
-    out = rollout(config, start, commands, measured=True)
-    true, measured = out.states, out.measured
-    assert torch.allclose(measured[..., 2], true[..., 2] + angle)
-    assert torch.allclose(measured[..., :2], true[..., :2])
-    # The velocity in the world frame is unchanged.
-    for states in (true, measured):
-        states_vx = states[..., 3] * torch.cos(states[..., 2]) - states[..., 4] * torch.sin(states[..., 2])
-        assert torch.allclose(
-            states_vx, true[..., 3] * torch.cos(true[..., 2]) - true[..., 4] * torch.sin(true[..., 2])
-        )
-    small = torch.stack([true[..., 3] + angle * true[..., 4], true[..., 4] - angle * true[..., 3]], dim=-1)
-    assert (measured[..., 3:5] - small).abs().max() < angle**2 * 3
-    plant = Plant(SimulatorConfig(effects={"mocap_yaw_misalignment": {"angle": angle}}))
-    assert plant.measured_pose(0.0).yaw_rad == pytest.approx(angle)

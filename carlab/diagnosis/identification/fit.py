@@ -106,7 +106,7 @@ class Fit:
         return {f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)}
 
 
-class Linearised(NamedTuple):
+class Linearisation(NamedTuple):
     """Whitened errors (S, U, 6) and their Jacobian (n, S, U, 6)."""
 
     jacobian: FloatArray
@@ -251,16 +251,16 @@ class Fitter:
         loss = self.huber(white).sum(axis=(1, 2))
         return Fit(fitted, free, z, cost, np.asarray(loss))
 
-    def with_covariance(self, fit: Fit, at: Linearised | None = None) -> Fit:
+    def with_covariance(self, fit: Fit, linearisation: Linearisation | None = None) -> Fit:
         """The same fit with its sandwich covariance, clustered by block (White 1980; Liang and Zeger 1986).
 
         Args:
             fit: n parameters.
-            at: the errors linearised at the fit, if they are known.
+            linearisation: of the errors at the fit; computed by default.
         """
         if not fit.free:
             return replace(fit, covariance=np.zeros((0, 0)), design_effects=np.zeros(0))
-        jacobian, white = at or self.linearised(fit)
+        jacobian, white = linearisation or self.linearised(fit)
         normal, score = self._normal(fit, jacobian, white)
         blocks, index = np.unique(self.windows.block, return_inverse=True)
         clustered = np.stack([np.bincount(index, weights=row, minlength=len(blocks)) for row in score])
@@ -272,7 +272,7 @@ class Fitter:
         return replace(fit, covariance=sandwich, design_effects=design_effects)
 
     def leave_fold_out_loss(
-        self, fit: Fit, folds: IndexArray, max_error: float, at: Linearised | None = None
+        self, fit: Fit, folds: IndexArray, max_error: float, linearisation: Linearisation | None = None
     ) -> FloatArray:
         """Loss of every window (S,) by a fit without its fold, whitened errors clipped at ``max_error``.
 
@@ -280,12 +280,12 @@ class Fitter:
             fit: fit to all windows.
             folds: index of each window's fold (S,).
             max_error: bound of the whitened errors.
-            at: the errors linearised at the fit, if they are known.
+            linearisation: of the errors at the fit; computed by default.
         """
         if not fit.free:
             return self.loss(fit.config, max_error=max_error)
         loss = np.zeros(len(self.windows))
-        for own, _, white in self._without_each_fold(fit, folds, at or self.linearised(fit)):
+        for own, _, white in self._without_each_fold(fit, folds, linearisation or self.linearised(fit)):
             loss[own] = self.huber(white.clip(-max_error, max_error)).sum(axis=(1, 2))
         return loss
 
@@ -298,14 +298,14 @@ class Fitter:
         return z
 
     def _without_each_fold(
-        self, fit: Fit, folds: IndexArray, at: Linearised
+        self, fit: Fit, folds: IndexArray, linearisation: Linearisation
     ) -> Iterator[tuple[NDArray[np.bool_], FloatArray, FloatArray]]:
         """For each fold: its windows (S,), coordinates (n,) of a fit without it, and its whitened errors.
 
         Each fold is removed from ``fit`` by one Gauss-Newton step (Beirami et al. 2017, approximate leave-k-out), at
         the cost of a few predictions; a refit costs a hundred.
         """
-        jacobian, white = at
+        jacobian, white = linearisation
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         normal, score = self._normal(fit, jacobian, white)
         for name in np.unique(folds):
@@ -321,10 +321,10 @@ class Fitter:
             best = int(np.argmin(other_costs))
             yield own, trials[best], whites[best, own]
 
-    def linearised(self, fit: Fit) -> Linearised:
+    def linearised(self, fit: Fit) -> Linearisation:
         """The whitened errors linearised at a fit."""
         white = self.white(fit.config, fit.free, fit.z[None])[0]
-        return Linearised(self.jacobian(fit.config, fit.free, fit.z, white), white)
+        return Linearisation(self.jacobian(fit.config, fit.free, fit.z, white), white)
 
     def _normal(self, fit: Fit, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix (n, n) with the prior, and each window's score (n, S)."""

@@ -24,8 +24,8 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
     screened = screen_candidates(problem, model, names, control)
     fitter = problem.fitter(model.scale)
-    at = fitter.linearised(model.fit)
-    chosen = _to_refit(problem, screened, fitter.with_covariance(model.fit, at).design_effect)
+    linearisation = fitter.linearised(model.fit)
+    chosen = _to_refit(problem, screened, fitter.with_covariance(model.fit, linearisation).design_effect)
     done, steps = len(model.effects), problem.settings.selection.max_effects
     fitted = control.workers.map(
         refit_candidate,
@@ -40,7 +40,7 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     if not refitted:
         return ()
     limit = problem.settings.selection.max_left_out_error
-    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), limit, at)
+    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), limit, linearisation)
     return _tested(problem, model, refitted, reference, control)
 
 
@@ -87,9 +87,10 @@ def with_left_out_gain(
     problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray
 ) -> Candidate:
     """The candidate with its chi2 and with its gain over ``reference`` (S,) on left-out blocks."""
-    at = fitter.linearised(candidate.fit)
-    fit = fitter.with_covariance(candidate.fit, at)
-    loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_left_out_error, at)
+    linearisation = fitter.linearised(candidate.fit)
+    fit = fitter.with_covariance(candidate.fit, linearisation)
+    limit = problem.settings.selection.max_left_out_error
+    loss = fitter.leave_fold_out_loss(fit, problem.folds(), limit, linearisation)
     gain, error = clustered_gain(reference, loss, problem.windows)
     chi2 = 2.0 * candidate.gain / design_effect_of(fit, candidate.effect)
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, Fitter
@@ -127,31 +128,35 @@ class Screen:
     ) -> FloatArray:
         """Directions (D, n) scaled to the settings' changes of the errors; coordinates in ``held`` are not scaled."""
         settings = self.settings
-        moves = np.array([k not in held for k in range(len(free))])
-
-        def scaled(sizes: FloatArray) -> FloatArray:
-            """Each direction at its sizes (D, W), within the bounds: points (D W, n)."""
-            low, high = np.sort([[f.coordinate(v) for v in (f.low, f.high)] for f in free], axis=1).T
-            points = np.where(moves, sizes[:, :, None] * directions[:, None], directions[:, None])
-            return np.asarray(points.clip(low, high).reshape(-1, len(free)))
-
-        probes = np.tile(settings.probe_sizes, (len(directions), 1))
-        points = scaled(probes)
-        moved = self._moved(config, free, points)
-        change = np.array([np.sqrt(np.mean(self._change(each) ** 2)) for each in moved])
+        is_scaled = np.array([k not in held for k in range(len(free))])
+        probes = _points_along(free, directions, is_scaled, np.tile(settings.probe_sizes, (len(directions), 1)))
+        moved = self._moved(config, free, probes.reshape(-1, len(free)))
+        changes = np.array([np.sqrt(np.mean(self._change(each) ** 2)) for each in moved]).reshape(probes.shape[:2])
         wanted = np.array(settings.error_rms_changes)
-        along = np.where(moves & (directions != 0.0), directions, np.inf)[:, None]
-        reached = np.abs(points.reshape(*probes.shape, -1) / along).max(axis=2)
         sizes = [
             size_of_change(wanted, *each, settings.probe_exponents)
-            for each in zip(reached, change.reshape(probes.shape), strict=True)
+            for each in zip(_sizes_along(probes, directions, is_scaled), changes, strict=True)
         ]
-        return scaled(np.array(sizes))
+        return _points_along(free, directions, is_scaled, np.array(sizes)).reshape(-1, len(free))
 
     def _change(self, moved: FloatArray) -> FloatArray:
         """Clipped change (S U 6,) to the whitened errors ``moved`` (S, U, 6)."""
         limit = self.settings.max_whitened_change
         return np.asarray(np.clip(moved.reshape(-1) - self.white, -limit, limit))
+
+
+def _points_along(
+    free: Sequence[FitParameter], directions: FloatArray, is_scaled: NDArray[np.bool_], sizes: FloatArray
+) -> FloatArray:
+    """Points (D, W, n) along each of the directions (D, n) at its sizes (D, W), within the bounds of the parameters."""
+    low, high = np.sort([[f.coordinate(v) for v in (f.low, f.high)] for f in free], axis=1).T
+    return np.where(is_scaled, sizes[:, :, None] * directions[:, None], directions[:, None]).clip(low, high)
+
+
+def _sizes_along(points: FloatArray, directions: FloatArray, is_scaled: NDArray[np.bool_]) -> FloatArray:
+    """Sizes (D, W) of points (D, W, n) along their directions (D, n); smaller than intended at a bound."""
+    steps = np.where(is_scaled & (directions != 0.0), directions, np.inf)
+    return np.asarray(np.abs(points / steps[:, None]).max(axis=2))
 
 
 def size_of_change(
