@@ -11,6 +11,7 @@ import numpy as np
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
+from carlab.diagnosis.identification.fit_parameters import stated_value
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
@@ -26,12 +27,12 @@ from sim_backends.registry import REGISTRY
 class Texts:
     """Functions that return texts of the report.
 
-    effect             sentence of an effect with its numbers
+    effect             sentence of an effect with its numbers, and with those of the car file if it states the effect
     separating_drive   manoeuvre that separates an effect from its confusable ones
     confusable        confusable effects by effect id
     """
 
-    effect: Callable[[str, Mapping[str, Estimate]], str]
+    effect: Callable[[str, Mapping[str, Estimate], Mapping[str, float]], str]
     separating_drive: Callable[[str, Sequence[str]], str]
     confusable: Mapping[str, Sequence[str]]
 
@@ -113,6 +114,9 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
     error = held_out.final_error(without.config)
     gain, spread = held_out.gain(error, full)
     parameters = {p.name: estimate(scored, f"effects.{name}.{p.name}") for p in EFFECTS[name].parameters}
+    nominal = scored.problem.nominal
+    stated = {p.name: stated_value(nominal, name, p.name) for p in EFFECTS[name].parameters}
+    car_file_values = {parameter: value for parameter, value in stated.items() if value is not None}
     others = found.indistinguishable.get(name, ())
     evidence = Evidence(
         held_out_error_reduction=1.0 - held_out.score(full) / max(held_out.score(error), 1e-12),
@@ -126,9 +130,10 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
         parameters=parameters,
         where=_where(scored, name, parameters, error, without),
         evidence=evidence,
-        sentence=texts.effect(name, parameters),
+        sentence=texts.effect(name, parameters, car_file_values),
         indistinguishable_from=others,
         separating_drive=texts.separating_drive(name, others) if others else "",
+        car_file_values=car_file_values,
     )
 
 

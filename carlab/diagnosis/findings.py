@@ -53,7 +53,19 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class EffectFinding:
-    """An accepted effect; ``separating_drive`` is the manoeuvre that separates its set of indistinguishable effects."""
+    """An accepted effect.
+
+    Attributes:
+        id: id of the effect.
+        confidence: probability that the name is right.
+        parameters: fitted value of each parameter.
+        where: channels, regime, time and place of its influence.
+        evidence: its strength on held-out windows.
+        sentence: the finding with its numbers.
+        indistinguishable_from: effects that explain the recordings as well.
+        separating_drive: the manoeuvre that separates this set.
+        car_file_values: value of each parameter in the car file; empty if the car file does not state the effect.
+    """
 
     id: str
     confidence: float
@@ -63,6 +75,7 @@ class EffectFinding:
     sentence: str
     indistinguishable_from: tuple[str, ...] = ()
     separating_drive: str = ""
+    car_file_values: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

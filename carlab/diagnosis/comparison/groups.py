@@ -25,7 +25,7 @@ from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.windows import IndexArray, PredictionWindows, RecordingSegment, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CURVES, confusable_effects
+from sim_backends.effects import CATALOGUE, confusable_effects
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,7 @@ def compared_groups(
     per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
     floor = np.sqrt(np.mean(per_step**2, axis=0))
     problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), (), settings)
-    curves = tuple(f"effects.{curve.id}." for curve in CURVES)
-    free = tuple(f for f in problem.free_parameters(()) if not f.name.startswith(curves))  # measured curves stay
+    free = problem.free_parameters([name for name in nominal.effects if name in CATALOGUE])  # measured curves stay
     fitted = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
     limits = settings.comparison.max_windows
     one, two = (

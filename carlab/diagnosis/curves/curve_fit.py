@@ -66,11 +66,10 @@ def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl)
 def _effects_with(problem: SearchProblem, found: SearchResult, curves: tuple[str, ...]) -> tuple[str, ...]:
     """Accepted effects that no curve contains, and the effects that accompany every curve."""
     accepted = [e for e in found.effects if EFFECTS[e].represented_by not in curves]
-    present = (*accepted, *problem.nominal.effects)
     added = [
         e.id
         for e in CATALOGUE.values()
-        if e.fitted_with_curves and e.id not in present and is_applicable(problem.nominal, e.id)
+        if e.fitted_with_curves and e.id not in accepted and is_applicable(problem.nominal, e.id)
     ]
     return (*accepted, *added)
 

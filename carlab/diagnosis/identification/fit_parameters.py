@@ -29,6 +29,8 @@ BASE_PARAMETERS = (
 TYRE_PARAMETERS = tuple(name for name in BASE_PARAMETERS if name.startswith("tyre."))
 MIN_POSITIVE_SHARE = 1e-3
 """Smallest value of a parameter that must be positive, over its typical size."""
+MIN_PRIOR_SHARE = 1e-3
+"""Smallest prior standard deviation of a base parameter, over its value."""
 
 
 DIFFERENCE_STEP = 0.02
@@ -86,7 +88,10 @@ class FitParameter:
 def base_parameters(
     config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
 ) -> tuple[FitParameter, ...]:
-    """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency."""
+    """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency.
+
+    A standard deviation in the car file, as a diagnosis writes it, is that of the prior.
+    """
     values = config.values()
     names = list(BASE_PARAMETERS)
     if config.kind == "kinematic":
@@ -99,7 +104,9 @@ def base_parameters(
         share = settings.prior_std_share
         if name in config.priors:
             low, high = config.priors[name]
-            share = max((high - low) / (4.0 * abs(value)), 1e-3)
+            share = max((high - low) / (4.0 * abs(value)), MIN_PRIOR_SHARE)
+        if name in config.parameter_std and value > 0:
+            share = min(share, max(config.parameter_std[name] / value, MIN_PRIOR_SHARE))
         if value > 0:
             found.append(FitParameter(name, value, 0.1, low, high, True, share / 0.1))
         else:
@@ -115,24 +122,37 @@ def base_parameters(
 
 
 def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParameter, ...]:
-    """Parameters of one effect; a negative extra delay is at most the delay of the car file."""
+    """Parameters of one effect; z = 0 is the value that the car file states, or else the identity value.
+
+    A negative extra delay is at most the delay of the car file.
+    """
     found = []
     values = config.values()
     for p in EFFECTS[effect_id].parameters:
         name = f"effects.{effect_id}.{p.name}"
         size = abs(p.typical) or 1.0
+        stated = stated_value(config, effect_id, p.name)
         if p.choices:
             found.append(FitParameter(name, 0.0, 1.0, 0.0, len(p.choices) - 1.0, choice=True))
         elif p.identity is not None and math.isinf(p.identity):
-            found.append(FitParameter(name, p.typical, 0.3, max(p.low, 0.02 * p.typical), 50.0 * p.typical, True))
+            origin = p.typical if stated is None else stated
+            low, high = max(p.low, min(0.02 * p.typical, origin)), max(50.0 * p.typical, origin)
+            found.append(FitParameter(name, origin, 0.3, low, high, True))
         else:
-            origin = float(values.get(p.same_as, 0.0)) if p.identity is None else p.identity
-            low = max(p.low + MIN_POSITIVE_SHARE * size * p.positive, origin - 20.0 * size)
+            identity = float(values.get(p.same_as, 0.0)) if p.identity is None else p.identity
+            origin = identity if stated is None else stated
+            low = max(p.low + MIN_POSITIVE_SHARE * size * p.positive, min(identity - 20.0 * size, origin))
             if p.reduces:
                 low = max(low, -values[p.reduces])
-            high = min(p.high, origin + 20.0 * size)
+            high = min(p.high, max(identity + 20.0 * size, origin))
             found.append(FitParameter(name, origin, size, low, high, is_delay=p.is_delay))
     return tuple(found)
+
+
+def stated_value(config: SimulatorConfig, effect_id: str, parameter: str) -> float | None:
+    """Value that the car file states for a parameter of an effect; None without the effect."""
+    stated = config.effects.get(effect_id)
+    return None if stated is None else float(config.values()[f"effects.{effect_id}.{parameter}"])
 
 
 def difference_steps(free: Sequence[FitParameter]) -> FloatArray:
@@ -146,7 +166,12 @@ def values_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArr
 
 
 def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:
-    """Add an effect at its identity value or, if that is infinite, at a value with no influence."""
+    """Add an effect at its identity value or, if that is infinite, at a value with no influence.
+
+    An effect that the car file states keeps its values.
+    """
+    if effect_id in config.effects:
+        return config
     effect = EFFECTS[effect_id]
     given = {}
     for p in effect.parameters:

@@ -186,7 +186,7 @@ def _fit_with_refit(
     fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings
 ) -> tuple[_Candidate, list[_Candidate]]:
     """Refit all parameters, and add the effects with the best screening scores to the refit."""
-    own = [f for name in simulator.effects for f in effect_parameters(name, simulator)]
+    own = [f for name in _adjustable(simulator) for f in effect_parameters(name, simulator)]
     free = (*base_parameters(simulator), *own)
     refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=settings.fit_iterations)
     screen = Screen(fitter, simulator, refit, settings.screened_windows)
@@ -238,7 +238,13 @@ def _simulator_parameters(simulator: SimulatorConfig) -> list[tuple[str, tuple[F
     single = [(f.name, (f,)) for f in base]
     grip = tuple(f for f in base if f.name in GRIP_PARAMETERS)
     both = [(GRIP, grip)] if len(grip) == len(GRIP_PARAMETERS) else []
-    return [*single, *both, *((f"effects.{name}", effect_parameters(name, simulator)) for name in simulator.effects)]
+    effects = [(f"effects.{name}", effect_parameters(name, simulator)) for name in _adjustable(simulator)]
+    return [*single, *both, *effects]
+
+
+def _adjustable(simulator: SimulatorConfig) -> list[str]:
+    """Effects of the catalogue in the simulator; measured curves stay as they are."""
+    return [name for name in simulator.effects if name in CATALOGUE]
 
 
 def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> FloatArray:

@@ -109,7 +109,7 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     return {
         "id": effect.id,
         "noun": noun[0].upper() + noun[1:],
-        "sentence": effect.sentence or text.effect_sentence(effect.id, effect.parameters),
+        "sentence": effect.sentence or text.effect_sentence(effect.id, effect.parameters, effect.car_file_values),
         "confidence": effect.confidence,
         "confidence_text": text.confidence_text(effect.confidence, len(effect.indistinguishable_from)),
         "where": ", ".join(places),

@@ -95,8 +95,15 @@ def effect_noun(effect_id: str) -> str:
     return effect.name if effect is not None and effect.name else effect_id.replace("_", " ")
 
 
-def effect_sentence(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
-    """Sentence of an effect with values, units and 90 % intervals: ``Left out: the servo lags by 0.11 s ...``."""
+def effect_sentence(
+    effect_id: str, parameters: Mapping[str, Estimate], car_file_values: Mapping[str, float] | None = None
+) -> str:
+    """Sentence of an effect with values, units and 90 % intervals: ``Left out: the servo lags by 0.11 s ...``.
+
+    For an effect that the car file states: ``Wrong in the car file: a lag ...: time_constant is 0.11 s, not 0.05 s``.
+    """
+    if car_file_values:
+        return _wrong_numbers(effect_id, parameters, car_file_values)
     effect = EFFECTS.get(effect_id)
     if effect is None or not effect.sentence:
         numbers = ", ".join(f"{name} {_Filled(e)}" for name, e in parameters.items())
@@ -105,6 +112,19 @@ def effect_sentence(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
     filled = re.sub(r"\s+", " ", effect.sentence.format_map(fields))
     head, level, tail = filled.partition(AT_90)  # only the first interval states the level
     return f"Left out: {head}{level}{tail.replace(AT_90, '')}."
+
+
+def _wrong_numbers(effect_id: str, parameters: Mapping[str, Estimate], car_file_values: Mapping[str, float]) -> str:
+    """Sentence of an effect that the car file states with other values."""
+    found = []
+    for name, e in parameters.items():
+        stated, unit = car_file_values[name], unit_text(e.unit)
+        if e.low90 == e.high90 == stated:
+            continue  # a form that the recordings confirm
+        interval = _interval(e.low90, e.high90, 1.0, e.at_limit)
+        found.append(f"{name} is {_scaled(e.value, 1.0, unit)}{interval}, not {_scaled(stated, 1.0, unit)}")
+    head, level, tail = listed(found).partition(AT_90)
+    return f"Wrong in the car file: {effect_noun(effect_id)}: {head}{level}{tail.replace(AT_90, '')}."
 
 
 def refutation_sentence(effect_id: str) -> str:
@@ -252,10 +272,7 @@ def explained_share(diagnosis: Diagnosis) -> float:
 
 def _mismatch(diagnosis: Diagnosis) -> str:
     effects = diagnosis.effects
-    counted = {1: "one effect", 2: "two effects", 3: "three effects", 4: "four effects"}
-    count = counted.get(len(effects), f"{len(effects)} effects")
-    nouns = listed([set_noun(effect) for effect in effects]) or "an effect that is not in this report"
-    text = f"The simulator leaves out {count}: {nouns}."
+    text = " ".join(_statements(effects))
     if fall := _fall(diagnosis, "refit", "with_effects"):
         share = explained_share(diagnosis)
         known = f", which explains {percent(share)} of the refit's squared excess over the noise floor"
@@ -263,6 +280,26 @@ def _mismatch(diagnosis: Diagnosis) -> str:
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
         text += f" {percent(diagnosis.unexplained.share)} of this excess stays unexplained."
     return text
+
+
+def _statements(effects: Sequence[EffectFinding]) -> list[str]:
+    """What is missing in the simulator, and what the car file states with wrong numbers."""
+    missing = [effect for effect in effects if not effect.car_file_values]
+    wrong = [effect for effect in effects if effect.car_file_values]
+    found = []
+    if missing or not wrong:
+        nouns = listed([set_noun(effect) for effect in missing]) or "an effect that is not in this report"
+        found.append(f"The simulator leaves out {_counted(max(len(missing), 1))}: {nouns}.")
+    if wrong:
+        count, have = _counted(len(wrong)), "has" if len(wrong) == 1 else "have"
+        nouns = listed([set_noun(effect) for effect in wrong])
+        found.append(f"{count[0].upper()}{count[1:]} of the car file {have} wrong numbers: {nouns}.")
+    return found
+
+
+def _counted(count: int) -> str:
+    counted = {1: "one effect", 2: "two effects", 3: "three effects", 4: "four effects"}
+    return counted.get(count, f"{count} effects")
 
 
 def _parameters(diagnosis: Diagnosis) -> str:

@@ -84,7 +84,8 @@ def completed(diagnosis: Diagnosis) -> Diagnosis:
     command = text.drive_command(drive)
     advice = diagnosis.advice or (f"{why} Drive it with: {command}" if command else why)
     effects = tuple(
-        replace(e, sentence=e.sentence or text.effect_sentence(e.id, e.parameters)) for e in diagnosis.effects
+        replace(e, sentence=e.sentence or text.effect_sentence(e.id, e.parameters, e.car_file_values))
+        for e in diagnosis.effects
     )
     return replace(diagnosis, sentence=sentence, effects=effects, advice=advice)
 
@@ -97,7 +98,7 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoi
     lines = ["Car file written by carlab diagnose; use it with --car, or diagnose again from it."]
     lines.append(f"Verdict: {diagnosis.verdict}." + (f" Named effects: {found}." if found else " No named effects."))
     for effect in diagnosis.effects:
-        lines.append(effect.sentence or text.effect_sentence(effect.id, effect.parameters))
+        lines.append(effect.sentence or text.effect_sentence(effect.id, effect.parameters, effect.car_file_values))
         if effect.indistinguishable_from:
             others = text.listed(list(effect.indistinguishable_from), "or")
             lines.append(f"These recordings do not distinguish {effect.id} from {others}.")

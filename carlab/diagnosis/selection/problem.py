@@ -28,7 +28,7 @@ from sim_backends.effects import CATALOGUE, EFFECTS
 class SearchProblem:
     """A simulator, prediction windows of recordings, and candidate effects.
 
-    nominal       simulator of the car file; its effects stay, and their parameters are fitted
+    nominal       simulator of the car file; its effects keep their values, unless they are accepted as wrong
     windows       windows of the recordings to fit
     floor   (6,)  standard deviation of each channel's error of a perfect simulator, in SI units
     measured_std  standard deviations (6,) of the noise of the measured channels, in SI units
@@ -52,16 +52,15 @@ class SearchProblem:
 
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
         """Free parameters of a fit with ``effects``."""
-        own = [f for name in self.nominal.effects for f in effect_parameters(name, self.nominal)]
         added = [f for name in effects for f in effect_parameters(name, self.nominal)]
-        return (*base_parameters(self.nominal, self.settings.identification), *own, *added)
+        return (*base_parameters(self.nominal, self.settings.identification), *added)
 
     def fitter(self, scale: Scale) -> Fitter:
         """A fitter for the windows with an error scale."""
         return Fitter(self.windows, scale, self.settings.identification)
 
     def config_with(self, effects: Sequence[str]) -> SimulatorConfig:
-        """The simulator with ``effects`` added at their identity values."""
+        """The simulator with ``effects`` added, at the values of the car file or else at their identity values."""
         config = self.nominal
         for name in effects:
             config = with_effect(config, name)
@@ -74,8 +73,7 @@ class SearchProblem:
 
     def is_candidate(self, effect: str) -> bool:
         """Whether the effect may be accepted."""
-        known = effect in self.candidates and effect not in self.nominal.effects
-        return known and is_applicable(self.nominal, effect)
+        return effect in self.candidates and is_applicable(self.nominal, effect)
 
     def folds(self) -> IndexArray:
         """Index of each window's fold (S,); the windows of a block are in one fold."""

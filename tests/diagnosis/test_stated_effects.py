@@ -1,0 +1,138 @@
+"""Test effects, measured curves and standard deviations that the car file states."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import Case
+from carlab.benchmark.world.measurement import write_csv
+from carlab.cars import load_car_file
+from carlab.diagnosis.diagnose import Outcome, diagnose
+from carlab.diagnosis.evidence import Texts
+from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, Estimate, Evidence
+from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, verdict_sentence
+from carlab.diagnosis.report.write import completed
+from carlab.diagnosis.selection.problem import SearchProblem
+from carlab.diagnosis.settings import DEFAULT
+from carlab.prediction.windows import cut_windows, segments_of
+from carlab.recording.csv.foreign import import_csv
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import CATALOGUE, CURVES, confusable_effects
+
+TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
+FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
+"""A quarter of the windows of the default."""
+MISALIGNMENT = "mocap_yaw_misalignment"
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    """A drive of a car without missing physics, with wrong base parameters."""
+    return make_case("null", 22, fit_s=45, hold_s=20)
+
+
+@pytest.fixture
+def nominal(case: Case, tmp_path: Path) -> SimulatorConfig:
+    case.nominal.write(tmp_path / "car.toml")
+    return load_car_file(tmp_path / "car.toml").simulator
+
+
+@pytest.fixture(autouse=True)
+def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search two effects only, because the whole catalogue takes long."""
+    few = {name: CATALOGUE[name] for name in (MISALIGNMENT, "aerodynamic_drag")}
+    monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", few)
+
+
+def diagnosed(case: Case, folder: Path, nominal: SimulatorConfig, angle_rad: float, stated_rad: float) -> Outcome:
+    """Diagnose drives that a camera system sees turned by an angle, where the car file states another angle."""
+    sin, cos = np.sin(angle_rad), np.cos(angle_rad)
+    read = []
+    for table in (case.fit, case.hold):
+        vx, vy = table["vx"], table["vy"]
+        turned = {"yaw": table["yaw"] + angle_rad, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}
+        write_csv(folder / "drive.csv", table | turned)
+        read.append(list(import_csv(folder / "drive.csv").episodes))
+    stated = replace(nominal, effects={MISALIGNMENT: {"angle": stated_rad}})
+    return diagnose(*read, stated, TEXTS, settings=FEWER)
+
+
+def test_wrong_number_of_a_stated_effect_is_named(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
+    outcome = diagnosed(case, tmp_path, nominal, angle_rad=0.06, stated_rad=0.02)
+    (effect,) = outcome.diagnosis.effects
+    assert effect.id == MISALIGNMENT
+    assert effect.car_file_values == {"angle": 0.02}
+    assert effect.parameters["angle"].value == pytest.approx(0.06, abs=0.006)
+    assert effect.sentence.startswith("Wrong in the car file: ")
+    assert effect.sentence.endswith("not 0.02 rad.")
+    assert outcome.model.effects[MISALIGNMENT]["angle"] == effect.parameters["angle"].value
+    report = completed(outcome.diagnosis).to_dict()
+    assert report["effects"][0]["car_file_values"] == {"angle": 0.02}
+    assert report["sentence"].startswith("One effect of the car file has wrong numbers: ")
+
+
+def test_correct_number_of_a_stated_effect_stays(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
+    outcome = diagnosed(case, tmp_path, nominal, angle_rad=0.06, stated_rad=0.06)
+    assert outcome.diagnosis.effects == ()
+    assert outcome.model.effects == {MISALIGNMENT: {"angle": 0.06}}
+
+
+def test_stated_values_are_the_origin_of_every_effect(nominal: SimulatorConfig) -> None:
+    """Also of effects whose identity is infinite, and of values far outside the usual range."""
+    for name in CATALOGUE:
+        config = with_effect(nominal, name)
+        stated = {f"{f.name}": float(f.value(np.array(0.37))) for f in effect_parameters(name, nominal) if not f.choice}
+        config = config.with_values(stated)
+        assert with_effect(config, name) is config
+        for f in effect_parameters(name, config):
+            if not f.choice:
+                assert float(f.value(np.array(0.0))) == pytest.approx(stated[f.name])
+                assert f.coordinate(stated[f.name]) == pytest.approx(0.0, abs=1e-9)
+    far = replace(nominal, effects={"motor_lag": {"time_constant": 4.0}})
+    (lag,) = effect_parameters("motor_lag", far)
+    assert float(lag.value(np.array(0.0))) == 4.0
+
+
+def test_measured_curves_of_the_car_file_are_not_fitted(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
+    write_csv(tmp_path / "drive.csv", case.fit)
+    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
+    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
+    config = nominal
+    for curve in CURVES:
+        config = with_effect(config, curve.id)
+    problem = SearchProblem(config, windows, np.ones(6), np.ones(6), {})
+    assert {f.name for f in problem.free_parameters(())} == {f.name for f in base_parameters(nominal)}
+    assert not any(problem.is_candidate(curve.id) for curve in CURVES)
+
+
+def test_standard_deviation_of_the_car_file_is_that_of_the_prior(nominal: SimulatorConfig) -> None:
+    name = "motor.drive_gain"
+    value = nominal.values()[name]
+    known = replace(nominal, parameter_std={name: 0.04 * value})
+    (before,), (after,) = ([f for f in base_parameters(c) if f.name == name] for c in (nominal, known))
+    at_one_std = [float(f.value(np.array(f.prior_z))) for f in (before, after)]
+    assert at_one_std[1] == pytest.approx(value * np.exp(0.04))
+    assert at_one_std[0] > at_one_std[1]
+    wide = replace(nominal, parameter_std={name: 10.0 * value})
+    assert [f.prior_z for f in base_parameters(wide)] == [f.prior_z for f in base_parameters(nominal)]
+
+
+def test_sentence_counts_missing_and_wrong_effects_apart() -> None:
+    def finding(name: str, values: dict[str, float]) -> EffectFinding:
+        lag = {"time_constant": Estimate(0.11, 0.01, 0.1, 0.12, "s")}
+        nowhere, no_evidence = ErrorLocation((), "", None, None, None), Evidence(0.0, 0.0, 0.0, {})
+        return EffectFinding(name, 0.9, lag, nowhere, no_evidence, "", car_file_values=values)
+
+    effects = (finding("steering_lag", {}), finding("motor_lag", {"time_constant": 0.05}))
+    diagnosis = Diagnosis("mismatch", "", effects, {}, 1.0, {}, None, (), (), 0, 0.0)
+    assert verdict_sentence(diagnosis) == (
+        "The simulator leaves out one effect: a lag of the steering servo. "
+        "One effect of the car file has wrong numbers: a lag of the motor."
+    )
+    assert completed(diagnosis).effects[1].sentence == (
+        "Wrong in the car file: a lag of the motor: time_constant is 0.11 s (0.1 to 0.12 at 90 %), not 0.05 s."
+    )
