@@ -87,6 +87,21 @@ def accept_names(
     return NamingResult(found, residual, rival, vibration)
 
 
+def accept_given_names(
+    problem: SearchProblem, found: SearchResult, held_out: HeldOut, vibration: Vibration | None, control: RunControl
+) -> NamingResult:
+    """Withdraw harmful effects of a search among given ones, and model the residual.
+
+    Most of the catalogue was not searched, so unnamed physics says nothing about the accepted effects.
+    """
+    if found.effects and _increases_held_out_error(found, held_out):
+        log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
+        found = found.without_effects()
+    elif found.effects:
+        found = without_harmful_effects(problem, found, held_out, control)
+    return NamingResult(found, residual_of(problem, found), None, vibration)
+
+
 def with_fewer_effects(
     problem: SearchProblem, naming: NamingResult, found: SearchResult, control: RunControl
 ) -> NamingResult:

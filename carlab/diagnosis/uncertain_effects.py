@@ -25,7 +25,9 @@ MIN_OFFSET = 1e-9
 
 
 def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> ScoredSearch:
-    """The search without effects whose numbers do not differ from their identity; unchanged without a joint fit.
+    """The search without effects whose numbers do not differ from those of the car file, or else from their identity.
+
+    Unchanged without a joint fit.
 
     Effects are removed one by one, the most uncertain first, because two that resemble each other are uncertain only
     together.
@@ -48,12 +50,14 @@ def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> Scor
 
 
 def identity_distance(scored: ScoredSearch, effect: str) -> float:
-    """Mahalanobis distance of the effect's numbers from their identities, by the covariance of the fit.
+    """Mahalanobis distance of the effect's numbers from those of the car file, or else from their identities.
 
-    Infinite for an effect with a number without a finite identity, or with a number at the other end of its range.
+    It is that of the covariance of the fit. Infinite for an effect with a number without a finite identity, with a
+    number at the other end of its range, or with another form than in the car file.
     """
-    numbers = {f"effects.{effect}.{p.name}": p for p in EFFECTS[effect].parameters if not p.choices}
-    if any(p.identity is None or math.isinf(p.identity) for p in numbers.values()):
+    numbers = {f"effects.{effect}.{p.name}": p for p in EFFECTS[effect].parameters}
+    is_stated = effect in scored.problem.nominal.effects
+    if not is_stated and any(p.identity is None or math.isinf(p.identity) for p in numbers.values() if not p.choices):
         return math.inf
     fit = scored.fit
     assert fit.covariance is not None
@@ -62,6 +66,10 @@ def identity_distance(scored: ScoredSearch, effect: str) -> float:
         if each.name not in numbers:
             continue
         value = float(each.value(np.array(fit.z[k])))  # the coordinate may lie beyond a bound
+        if each.choice:
+            if is_stated and value != each.origin:
+                return math.inf
+            continue
         offset = each.coordinate(value)
         if fit.covariance[k, k] > MIN_VARIANCE:
             own.append(k)

@@ -13,10 +13,12 @@ from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, Estimate, Evidence
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, verdict_sentence
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.selection.problem import SearchProblem
+from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
@@ -113,12 +115,83 @@ def test_standard_deviation_of_the_car_file_is_that_of_the_prior(nominal: Simula
     name = "motor.drive_gain"
     value = nominal.values()[name]
     known = replace(nominal, parameter_std={name: 0.04 * value})
-    (before,), (after,) = ([f for f in base_parameters(c) if f.name == name] for c in (nominal, known))
+    change_share = DEFAULT.identification.prior_change_share
+    (before,), (after,) = ([f for f in base_parameters(c, uses_std=True) if f.name == name] for c in (nominal, known))
     at_one_std = [float(f.value(np.array(f.prior_z))) for f in (before, after)]
-    assert at_one_std[1] == pytest.approx(value * np.exp(0.04))
+    assert at_one_std[1] == pytest.approx(value * np.exp(np.hypot(0.04, change_share)))
     assert at_one_std[0] > at_one_std[1]
     wide = replace(nominal, parameter_std={name: 10.0 * value})
-    assert [f.prior_z for f in base_parameters(wide)] == [f.prior_z for f in base_parameters(nominal)]
+    assert base_parameters(wide, uses_std=True) == base_parameters(nominal)
+    assert base_parameters(known) == base_parameters(nominal)
+
+
+def test_car_that_changed_by_a_fifth_is_not_held_by_the_prior(
+    case: Case, tmp_path: Path, nominal: SimulatorConfig
+) -> None:
+    """The drive gain of the car file is a fifth too large, with a standard deviation of half a per cent."""
+    name = "motor.drive_gain"
+    true = diagnosed(case, tmp_path, nominal, 0.0, 0.0).diagnosis.parameters[name].value
+    wrong = nominal.with_values({name: 1.2 * true})
+    known = replace(wrong, parameter_std={name: 0.006 * true})
+    found = diagnosed(case, tmp_path, known, 0.0, 0.0).diagnosis
+    assert found.effects == ()
+    assert found.parameters[name].value == pytest.approx(true, rel=0.02)
+
+
+def test_a_choice_of_the_car_file_is_the_origin(nominal: SimulatorConfig) -> None:
+    stated = replace(nominal, effects={"torque_steer": {"coefficient": 0.1, "source": 1.0}})
+    coefficient, source = effect_parameters("torque_steer", stated)
+    assert (float(coefficient.value(np.array(0.0))), float(source.value(np.array(0.0)))) == (0.1, 1.0)
+    assert float(source.value(np.array(source.coordinate(0.0)))) == 0.0
+    sentence = effect_sentence(
+        "torque_steer",
+        {"coefficient": Estimate(0.1, 0.01, 0.09, 0.11, "N m"), "source": Estimate(0.0, 0.0, 0.0, 0.0, "1")},
+        {"coefficient": 0.2, "source": 1.0},
+    )
+    assert "source is throttle, not force" in sentence
+
+
+def test_infinite_number_of_the_car_file_is_screened(nominal: SimulatorConfig) -> None:
+    """``rate = inf`` states that the servo is not limited."""
+    (rate,) = effect_parameters(
+        "steering_rate_limit", replace(nominal, effects={"steering_rate_limit": {"rate": np.inf}})
+    )
+    assert np.isfinite(rate.coordinate(np.inf))
+    assert np.isfinite(rate.value(np.array(0.0)))
+
+
+def test_tyre_curve_of_the_car_file_is_a_base_parameter(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
+    """It replaces the tyres of the car file, so another floor changes its numbers."""
+    write_csv(tmp_path / "drive.csv", case.fit)
+    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
+    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
+    linear = replace(nominal, kind="linear_tyre")
+    problem = SearchProblem(with_effect(linear, "tyre_saturation"), windows, np.ones(6), np.ones(6), {})
+    assert "effects.tyre_saturation.mu_front" in {f.name for f in problem.free_parameters(())}
+    assert not problem.is_candidate("tyre_saturation")
+    assert SearchProblem(linear, windows, np.ones(6), np.ones(6), {}).is_candidate("tyre_saturation")
+
+
+@pytest.mark.parametrize(("name", "values", "better"), [
+    ("friction_ellipse", {"scale": 0.8, "action": 0.0}, {"scale": 0.4, "action": 0.0}),
+    ("low_friction_patch", {"x": 0.5, "y": 0.2, "radius": 0.8, "loss": 0.5},
+     {"x": 0.5, "y": 0.2, "radius": 0.8, "loss": 0.7}),
+])  # fmt: skip
+def test_screening_moves_stated_numbers_to_both_sides(
+    nominal: SimulatorConfig, case: Case, tmp_path: Path, name: str, values: dict[str, float], better: dict[str, float]
+) -> None:
+    config = replace(nominal, effects={name: values})
+    write_csv(tmp_path / "drive.csv", case.fit)
+    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
+    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
+    steps = np.array([1, windows.steps])
+    fitter = Fitter(windows, Scale(steps, np.full((2, 6), 0.01)))
+    screen = Screen(fitter, config, Fit(config, (), np.zeros(0), 0.0, np.zeros(0)))
+    free = effect_parameters(name, config)
+    points = screen.points(name, free)
+    for f, column in zip(free, points.T, strict=True):
+        if not f.choice and better[f.name.rpartition(".")[2]] != values[f.name.rpartition(".")[2]]:
+            assert (column * f.coordinate(better[f.name.rpartition(".")[2]]) > 0.0).any()
 
 
 def test_sentence_counts_missing_and_wrong_effects_apart() -> None:

@@ -77,9 +77,23 @@ def test_distance_of_two_numbers_uses_their_correlation() -> None:
     free = effect_parameters("marker_offset", CAR)
     covariance = 0.25 * np.array([[1.0 + 0.01, 1.0 - 0.01], [1.0 - 0.01, 1.0 + 0.01]])
     fit = Fit(CAR, free, np.array([0.5, -0.5]), 0.0, np.zeros(1), covariance)
-    found = identity_distance(ScoredSearch(None, None, None, fit, {}, True), "marker_offset")  # type: ignore[arg-type]
-    assert found == pytest.approx(10.0)
-    assert identity_distance(ScoredSearch(None, None, None, fit, {}, True), "steering_rate_limit") == np.inf  # type: ignore[arg-type]
+    problem = SearchProblem(CAR, None, np.ones(6), np.ones(6), {})  # type: ignore[arg-type]
+    scored = ScoredSearch(problem, None, None, fit, {}, True)  # type: ignore[arg-type]
+    assert identity_distance(scored, "marker_offset") == pytest.approx(10.0)
+    assert identity_distance(scored, "steering_rate_limit") == np.inf
+
+
+def test_distance_from_the_numbers_and_the_form_of_the_car_file() -> None:
+    stated = replace(CAR, effects={"torque_steer": {"coefficient": 0.1, "source": 1.0}})
+    problem = SearchProblem(stated, None, np.ones(6), np.ones(6), {})  # type: ignore[arg-type]
+    free = effect_parameters("torque_steer", stated)
+    covariance = np.diag([0.25, 0.0])
+    same, other = (
+        ScoredSearch(problem, None, None, Fit(stated, free, np.array(z), 0.0, np.zeros(1), covariance), {}, True)  # type: ignore[arg-type]
+        for z in ([1.0, 0.0], [0.0, -1.0])
+    )
+    assert identity_distance(same, "torque_steer") == pytest.approx(2.0)
+    assert identity_distance(other, "torque_steer") == np.inf
 
 
 def test_fit_with_estimated_initial_states_decides_nothing(scored: ScoredSearch) -> None:

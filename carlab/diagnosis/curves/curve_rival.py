@@ -69,9 +69,9 @@ def _is_contained(effect: str) -> bool:
 
 
 def _is_free(problem: SearchProblem) -> bool:
-    """Whether neither the curve nor its offset is in the car file."""
+    """Whether the base model has the curve and its offset, and the curve is not in the car file."""
     added = SteeringOffset.id, SteeringCurve.id
-    return all(is_applicable(problem.nominal, e) and e not in problem.nominal.effects for e in added)
+    return SteeringCurve.id not in problem.nominal.effects and all(is_applicable(problem.nominal, e) for e in added)
 
 
 __all__ = ["curve_in_addition", "replacing_curve"]

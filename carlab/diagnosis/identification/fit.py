@@ -1,7 +1,7 @@
 """Fit of a simulator to prediction windows: robust Levenberg-Marquardt, all perturbations in one batch.
 
 Errors are whitened by channel and step. Huber's loss (Huber 1964) at four standard deviations bounds the influence of
-outliers. Base parameters have weak priors; parameters of effects have only bounds.
+outliers. Base parameters have priors (``fit_parameters``); parameters of effects have only bounds.
 """
 
 from __future__ import annotations

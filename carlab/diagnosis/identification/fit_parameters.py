@@ -29,8 +29,6 @@ BASE_PARAMETERS = (
 TYRE_PARAMETERS = tuple(name for name in BASE_PARAMETERS if name.startswith("tyre."))
 MIN_POSITIVE_SHARE = 1e-3
 """Smallest value of a parameter that must be positive, over its typical size."""
-MIN_PRIOR_SHARE = 1e-3
-"""Smallest prior standard deviation of a base parameter, over its value."""
 
 
 DIFFERENCE_STEP = 0.02
@@ -73,7 +71,7 @@ class FitParameter:
     def value(self, z: FloatArray) -> FloatArray:
         """Values at coordinates z, both (...)."""
         if self.choice:
-            return np.asarray(np.round(np.clip(z, self.low, self.high)))
+            return np.asarray(np.round(np.clip(self.origin + z, self.low, self.high)))
         raw = self.origin * np.exp(self.size * z) if self.logarithmic else self.origin + self.size * z
         return np.asarray(np.clip(raw, self.low, self.high))
 
@@ -86,11 +84,18 @@ class FitParameter:
 
 
 def base_parameters(
-    config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
+    config: SimulatorConfig,
+    settings: IdentificationSettings = DEFAULT.identification,
+    *,
+    uses_std: bool = False,
 ) -> tuple[FitParameter, ...]:
     """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency.
 
-    A standard deviation in the car file, as a diagnosis writes it, is that of the prior.
+    Args:
+        config: the simulator.
+        settings: widths of the priors.
+        uses_std: whether a standard deviation in the car file, as a diagnosis writes it, is the width of the prior,
+            together with the usual change of a car (``prior_change_share``).
     """
     values = config.values()
     names = list(BASE_PARAMETERS)
@@ -104,9 +109,9 @@ def base_parameters(
         share = settings.prior_std_share
         if name in config.priors:
             low, high = config.priors[name]
-            share = max((high - low) / (4.0 * abs(value)), MIN_PRIOR_SHARE)
-        if name in config.parameter_std and value > 0:
-            share = min(share, max(config.parameter_std[name] / value, MIN_PRIOR_SHARE))
+            share = max((high - low) / (4.0 * abs(value)), 1e-3)
+        if uses_std and name in config.parameter_std and value > 0:
+            share = min(share, math.hypot(config.parameter_std[name] / value, settings.prior_change_share))
         if value > 0:
             found.append(FitParameter(name, value, 0.1, low, high, True, share / 0.1))
         else:
@@ -133,9 +138,9 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
         size = abs(p.typical) or 1.0
         stated = stated_value(config, effect_id, p.name)
         if p.choices:
-            found.append(FitParameter(name, 0.0, 1.0, 0.0, len(p.choices) - 1.0, choice=True))
+            found.append(FitParameter(name, stated or 0.0, 1.0, 0.0, len(p.choices) - 1.0, choice=True))
         elif p.identity is not None and math.isinf(p.identity):
-            origin = p.typical if stated is None else stated
+            origin = p.typical if stated is None or math.isinf(stated) else stated
             low, high = max(p.low, min(0.02 * p.typical, origin)), max(50.0 * p.typical, origin)
             found.append(FitParameter(name, origin, 0.3, low, high, True))
         else:
@@ -147,6 +152,15 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
             high = min(p.high, max(identity + 20.0 * size, origin))
             found.append(FitParameter(name, origin, size, low, high, is_delay=p.is_delay))
     return tuple(found)
+
+
+def tyre_effects(config: SimulatorConfig) -> tuple[str, ...]:
+    """Effects of the car file whose parameters replace those of the tyres; they are base parameters of a fit."""
+    return tuple(
+        name
+        for name in config.effects
+        if (own := EFFECTS[name].parameters) and all(p.same_as in TYRE_PARAMETERS for p in own)
+    )
 
 
 def stated_value(config: SimulatorConfig, effect_id: str, parameter: str) -> float | None:

@@ -243,7 +243,7 @@ def _simulator_parameters(simulator: SimulatorConfig) -> list[tuple[str, tuple[F
 
 
 def _adjustable(simulator: SimulatorConfig) -> list[str]:
-    """Effects of the catalogue in the simulator; measured curves stay as they are."""
+    """Effects of the catalogue in the simulator; measured curves and other physics stay as they are."""
     return [name for name in simulator.effects if name in CATALOGUE]
 
 

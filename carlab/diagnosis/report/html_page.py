@@ -121,7 +121,7 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
         "reason": text.separating_reason(effect.id, effect.indistinguishable_from)
         if effect.indistinguishable_from
         else "",
-        "refutation": text.refutation_sentence(effect.id),
+        "refutation": text.refutation_sentence("" if effect.car_file_values else effect.id),
         "correlation": figures.correlation_chart(figure_data, effect.id),
         "fingerprint": figures.fingerprint_chart(effect) if evidence.deletion_fingerprint else None,
     }

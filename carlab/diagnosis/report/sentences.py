@@ -19,6 +19,7 @@ from carlab.diagnosis.report.numbers import unit_text as unit_text
 from carlab.diagnosis.report.numbers import with_unit as with_unit
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
+from sim_backends.registry import REGISTRY
 
 CHANNEL_NAMES = {
     "x": "longitudinal position",
@@ -119,10 +120,12 @@ def _wrong_numbers(effect_id: str, parameters: Mapping[str, Estimate], car_file_
     found = []
     for name, e in parameters.items():
         stated, unit = car_file_values[name], unit_text(e.unit)
-        if e.low90 == e.high90 == stated:
-            continue  # a form that the recordings confirm
-        interval = _interval(e.low90, e.high90, 1.0, e.at_limit)
-        found.append(f"{name} is {_scaled(e.value, 1.0, unit)}{interval}, not {_scaled(stated, 1.0, unit)}")
+        choices = REGISTRY[f"effects.{effect_id}.{name}"].choices
+        if choices and round(e.value) != round(stated):
+            found.append(f"{name} is {choices[round(e.value)]}, not {choices[round(stated)]}")
+        elif not choices:
+            interval = _interval(e.low90, e.high90, 1.0, e.at_limit)
+            found.append(f"{name} is {_scaled(e.value, 1.0, unit)}{interval}, not {_scaled(stated, 1.0, unit)}")
     head, level, tail = listed(found).partition(AT_90)
     return f"Wrong in the car file: {effect_noun(effect_id)}: {head}{level}{tail.replace(AT_90, '')}."
 
@@ -165,6 +168,8 @@ def verdict_title(diagnosis: Diagnosis) -> str:
     """Title of the verdict."""
     if diagnosis.effects and all(effect.indistinguishable_from for effect in diagnosis.effects):
         return "Missing physics is found, with more than one possible name"
+    if diagnosis.effects and all(effect.car_file_values for effect in diagnosis.effects):
+        return "Effects of the car file have wrong numbers"
     return VERDICT_TITLES[diagnosis.verdict]
 
 

@@ -121,7 +121,7 @@ def _compact(toml: str) -> str:
 
 
 def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
-    """The simulator with the standard deviation of every estimate; ``carlab learn`` uses it as prior width."""
+    """The simulator with the standard deviation of every estimate, and of values that stay; widths of later priors."""
     estimates = dict(diagnosis.parameters)
     for effect in diagnosis.effects:
         estimates |= {f"effects.{effect.id}.{name}": found for name, found in effect.parameters.items()}
@@ -131,7 +131,8 @@ def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> Simulato
         for name, found in estimates.items()
         if name in known and not REGISTRY[name].choices and 0.0 < found.std < math.inf and math.isfinite(known[name])
     }
-    return replace(model, parameter_std=parameter_std | _curve_std(diagnosis, known))
+    kept = {name: std for name, std in model.parameter_std.items() if name in known and name not in estimates}
+    return replace(model, parameter_std=kept | parameter_std | _curve_std(diagnosis, known))
 
 
 def _curve_std(diagnosis: Diagnosis, known: Mapping[str, float]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,
     effect_parameters,
+    tyre_effects,
     with_effect,
 )
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
@@ -52,8 +53,9 @@ class SearchProblem:
 
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
         """Free parameters of a fit with ``effects``."""
-        added = [f for name in effects for f in effect_parameters(name, self.nominal)]
-        return (*base_parameters(self.nominal, self.settings.identification), *added)
+        base = base_parameters(self.nominal, self.settings.identification, uses_std=True)
+        fitted = (*tyre_effects(self.nominal), *effects)
+        return (*base, *(f for name in fitted for f in effect_parameters(name, self.nominal)))
 
     def fitter(self, scale: Scale) -> Fitter:
         """A fitter for the windows with an error scale."""
@@ -73,7 +75,8 @@ class SearchProblem:
 
     def is_candidate(self, effect: str) -> bool:
         """Whether the effect may be accepted."""
-        return effect in self.candidates and is_applicable(self.nominal, effect)
+        known = effect in self.candidates and effect not in tyre_effects(self.nominal)
+        return known and is_applicable(self.nominal, effect)
 
     def folds(self) -> IndexArray:
         """Index of each window's fold (S,); the windows of a block are in one fold."""

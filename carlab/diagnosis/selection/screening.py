@@ -93,7 +93,8 @@ class Screen:
         if (scaled := EFFECTS[effect].screening_scaled) is not None:
             scalable = np.array([f.name.rpartition(".")[2] in scaled for f in free])
         factor = np.clip(along[order], *settings.step_range)[:, None]
-        starts = np.where(scalable, points[order] * factor, points[order])
+        low, high = _limits(free)
+        starts = np.where(scalable, points[order] * factor, points[order]).clip(low, high)
         return ScreeningResult(effect, float(gains[order[0]]) / self.share, starts)
 
     def gain(self, moved: FloatArray) -> tuple[float, float]:
@@ -112,12 +113,21 @@ class Screen:
         """Coordinates (P, n) at which the candidate is evaluated."""
         config, free = with_effect(self.config, effect), tuple(free)
         own = EFFECTS[effect].screening_points(_Probe(self, config, free))
+        if effect in self.config.effects:
+            around = self._around_stated(config, free)
+            return around if own is None else np.vstack([own, around])
         if own is not None:
             return own
         if len(free) == 1 and not free[0].logarithmic:
             return self.sized(config, free, np.array([[1.0], [-1.0]] if free[0].low < free[0].origin else [[1.0]]))
         grids = np.meshgrid(*(_grid(f, self.settings) for f in free), indexing="ij")
         return np.stack([g.ravel() for g in grids], axis=1)
+
+    def _around_stated(self, config: SimulatorConfig, free: tuple[FitParameter, ...]) -> FloatArray:
+        """Points (P, n) to both sides of each number that the car file states; choices stay."""
+        choices = tuple(k for k, f in enumerate(free) if f.choice)
+        axes = np.delete(np.eye(len(free)), choices, axis=0)
+        return self.sized(config, free, np.vstack([axes, -axes]), choices)
 
     def sized(
         self,
@@ -149,8 +159,14 @@ def _points_along(
     free: Sequence[FitParameter], directions: FloatArray, is_scaled: NDArray[np.bool_], sizes: FloatArray
 ) -> FloatArray:
     """Points (D, W, n) along each of the directions (D, n) at its sizes (D, W), within the bounds of the parameters."""
-    low, high = np.sort([[f.coordinate(v) for v in (f.low, f.high)] for f in free], axis=1).T
+    low, high = _limits(free)
     return np.where(is_scaled, sizes[:, :, None] * directions[:, None], directions[:, None]).clip(low, high)
+
+
+def _limits(free: Sequence[FitParameter]) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest coordinates (n,) of the parameters."""
+    low, high = np.sort([[f.coordinate(v) for v in (f.low, f.high)] for f in free], axis=1).T
+    return low, high
 
 
 def _sizes_along(points: FloatArray, directions: FloatArray, is_scaled: NDArray[np.bool_]) -> FloatArray:
@@ -181,7 +197,7 @@ def _grid(free: FitParameter, settings: ScreeningSettings) -> FloatArray:
     if free.logarithmic:
         return np.array([math.log(r) / free.size for r in settings.typical_size_ratios])
     if free.choice:
-        return np.arange(free.low, free.high + 1.0)
+        return np.arange(free.low, free.high + 1.0) - free.origin
     signs = (1.0, -1.0) if free.low < free.origin else (1.0,)
     return np.array([s * sign for s in (0.3, 1.0, 3.0) for sign in signs])
 

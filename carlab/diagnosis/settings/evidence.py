@@ -26,8 +26,9 @@ class EvidenceSettings:
     """The same for joint fits of parameters and initial states, whose errors are a third as large
     (docs/decisions/0023)."""
     identity_distance_min: float = 1.6449
-    """An effect is withdrawn if its numbers in a joint fit differ from their identities by less than this many standard
-    deviations (Mahalanobis distance, without ``joint_interval_factor``). An infinite identity has no distance."""
+    """An effect is withdrawn if its numbers in a joint fit differ from their identities, or from those of the car file,
+    by less than this many standard deviations (Mahalanobis distance, without ``joint_interval_factor``). An infinite
+    identity has no distance."""
     unexplained_score_min: float = 1.2
     """Refit score (noise floors) above which unnamed terms count as missing physics."""
     unexplained_score_min_without_term: float = 1.8

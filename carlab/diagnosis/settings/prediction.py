@@ -51,6 +51,9 @@ class IdentificationSettings:
     """Shares of that step that are evaluated; the share with the smallest loss on the other folds is used."""
     prior_std_share: float = 0.3
     """Prior standard deviation of a base parameter without a range, as a share of the car file's value."""
+    prior_change_share: float = 0.05
+    """Standard deviation of a base parameter between two recordings of a car, as a share of its value. It widens a
+    prior from an earlier diagnosis: battery, tyres and floor change by a few per cent from day to day."""
     latency_std_s: float = 0.01
     """Prior standard deviation [s] of a latency of motion capture that the car file does not state. Camera systems over
     a network have 3 to 30 ms."""
