@@ -117,8 +117,7 @@ def diagnose(
         texts: functions that phrase the report, and the confusable effects.
         uses: role of each recording, for the report.
         data_faults: faults that were found when the files were read; faults found here are added.
-        effects: candidate effects, the whole catalogue by default. Given effects are withdrawn only if
-            the held-out error is larger with them.
+        effects: candidate effects, the whole catalogue by default. Given ones are withdrawn only by held-out error.
         holdout_share: last share of each recording that is held out without ``held_out``; default: of the settings.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.

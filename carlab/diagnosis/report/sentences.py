@@ -30,6 +30,7 @@ CHANNEL_NAMES = {
     "yaw_rate": "yaw rate",
 }
 AT_90 = " at 90 %"
+COUNTED = {1: "one effect", 2: "two effects", 3: "three effects", 4: "four effects"}
 VERDICT_TITLES = {
     "mismatch": "Missing physics is found and named",
     "parameters": "Only parameters of the car file are wrong",
@@ -276,8 +277,7 @@ def explained_share(diagnosis: Diagnosis) -> float:
 
 
 def _mismatch(diagnosis: Diagnosis) -> str:
-    effects = diagnosis.effects
-    text = " ".join(_statements(effects))
+    effects, text = diagnosis.effects, " ".join(_statements(diagnosis.effects))
     if fall := _fall(diagnosis, "refit", "with_effects"):
         share = explained_share(diagnosis)
         known = f", which explains {percent(share)} of the refit's squared excess over the noise floor"
@@ -289,27 +289,22 @@ def _mismatch(diagnosis: Diagnosis) -> str:
 
 def _statements(effects: Sequence[EffectFinding]) -> list[str]:
     """What is missing in the simulator, and what the car file states with wrong numbers."""
-    missing = [effect for effect in effects if not effect.car_file_values]
-    wrong = [effect for effect in effects if effect.car_file_values]
+    missing = [set_noun(effect) for effect in effects if not effect.car_file_values]
+    wrong = [set_noun(effect) for effect in effects if effect.car_file_values]
     found = []
     if missing or not wrong:
-        nouns = listed([set_noun(effect) for effect in missing]) or "an effect that is not in this report"
-        found.append(f"The simulator leaves out {_counted(max(len(missing), 1))}: {nouns}.")
+        nouns = listed(missing) or "an effect that is not in this report"
+        found.append(
+            f"The simulator leaves out {COUNTED.get(max(len(missing), 1), f'{len(missing)} effects')}: {nouns}."
+        )
     if wrong:
-        count, have = _counted(len(wrong)), "has" if len(wrong) == 1 else "have"
-        nouns = listed([set_noun(effect) for effect in wrong])
-        found.append(f"{count[0].upper()}{count[1:]} of the car file {have} wrong numbers: {nouns}.")
+        count, have = COUNTED.get(len(wrong), f"{len(wrong)} effects"), "has" if len(wrong) == 1 else "have"
+        found.append(f"{count.capitalize()} of the car file {have} wrong numbers: {listed(wrong)}.")
     return found
 
 
-def _counted(count: int) -> str:
-    counted = {1: "one effect", 2: "two effects", 3: "three effects", 4: "four effects"}
-    return counted.get(count, f"{count} effects")
-
-
 def _parameters(diagnosis: Diagnosis) -> str:
-    fall = _fall(diagnosis, "nominal", "refit")
-    tail = f" With fitted parameters, {fall}." if fall else ""
+    tail = f" With fitted parameters, {fall}." if (fall := _fall(diagnosis, "nominal", "refit")) else ""
     text = "No missing physics is found. Parameters of the car file are wrong."
     return f"{text}{tail}{_warning_above_noise(diagnosis, 'refit')}"
 
@@ -324,10 +319,7 @@ def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
 
 def _none(diagnosis: Diagnosis) -> str:
     held = diagnosis.held_out.get("nominal")
-    text = (
-        "No missing physics is found. Neither other parameters nor an effect of the catalogue improves the prediction "
-        "of these recordings."
-    )
+    text = "No missing physics is found. Neither other parameters nor an effect improves the prediction."
     if held is None:
         return text
     return (
