@@ -75,6 +75,7 @@ def test_wrong_number_of_a_stated_effect_is_named(case: Case, tmp_path: Path, no
     report = completed(outcome.diagnosis).to_dict()
     assert report["effects"][0]["car_file_values"] == {"angle": 0.02}
     assert report["sentence"].startswith("One effect of the car file has wrong numbers: ")
+    assert " With corrected numbers, the position error " in report["sentence"]
 
 
 def test_correct_number_of_a_stated_effect_stays(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:

@@ -281,7 +281,9 @@ def _mismatch(diagnosis: Diagnosis) -> str:
     if fall := _fall(diagnosis, "refit", "with_effects"):
         share = explained_share(diagnosis)
         known = f", which explains {percent(share)} of the refit's squared excess over the noise floor"
-        text += f" With {'it' if len(effects) == 1 else 'them'}, {fall}{known if math.isfinite(share) else ''}."
+        named = "it" if len(effects) == 1 else "them"
+        named = "corrected numbers" if effects and all(e.car_file_values for e in effects) else named
+        text += f" With {named}, {fall}{known if math.isfinite(share) else ''}."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
         text += f" {percent(diagnosis.unexplained.share)} of this excess stays unexplained."
     return text
@@ -293,10 +295,8 @@ def _statements(effects: Sequence[EffectFinding]) -> list[str]:
     wrong = [set_noun(effect) for effect in effects if effect.car_file_values]
     found = []
     if missing or not wrong:
-        nouns = listed(missing) or "an effect that is not in this report"
-        found.append(
-            f"The simulator leaves out {COUNTED.get(max(len(missing), 1), f'{len(missing)} effects')}: {nouns}."
-        )
+        count = COUNTED.get(max(len(missing), 1), f"{len(missing)} effects")
+        found.append(f"The simulator leaves out {count}: {listed(missing) or 'an effect that is not in this report'}.")
     if wrong:
         count, have = COUNTED.get(len(wrong), f"{len(wrong)} effects"), "has" if len(wrong) == 1 else "have"
         found.append(f"{count.capitalize()} of the car file {have} wrong numbers: {listed(wrong)}.")
