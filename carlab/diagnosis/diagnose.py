@@ -28,8 +28,8 @@ from carlab.diagnosis.identification.measurement_noise import Noise, estimate_no
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.naming import (
     NamingResult,
-    accept_given_names,
     accept_names,
+    accept_requested_names,
     describe_unexplained,
     with_fewer_effects,
 )
@@ -117,7 +117,7 @@ def diagnose(
         texts: functions that phrase the report, and the confusable effects.
         uses: role of each recording, for the report.
         data_faults: faults that were found when the files were read; faults found here are added.
-        effects: candidate effects, the whole catalogue by default. Given ones are withdrawn only by held-out error.
+        effects: candidate effects, the whole catalogue by default. Requested ones are withdrawn by held-out error only.
         holdout_share: last share of each recording that is held out without ``held_out``; default: of the settings.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
@@ -219,7 +219,7 @@ def _search_effects(
     if request.effects is None:
         naming = accept_names(problem, found, held_out, vibration, search_control)
     else:
-        naming = accept_given_names(problem, found, held_out, vibration, search_control)
+        naming = accept_requested_names(problem, found, held_out, vibration, search_control)
     control.progress("scoring on held-out recordings", 0.82)
     scored = ScoredSearch.of(problem, naming.found, held_out)
     if request.effects is None:

@@ -11,7 +11,7 @@ import numpy as np
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
-from carlab.diagnosis.identification.fit_parameters import stated_value
+from carlab.diagnosis.identification.fit_parameters import stated_values
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
@@ -114,9 +114,7 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
     error = held_out.final_error(without.config)
     gain, spread = held_out.gain(error, full)
     parameters = {p.name: estimate(scored, f"effects.{name}.{p.name}") for p in EFFECTS[name].parameters}
-    nominal = scored.problem.nominal
-    stated = {p.name: stated_value(nominal, name, p.name) for p in EFFECTS[name].parameters}
-    car_file_values = {parameter: value for parameter, value in stated.items() if value is not None}
+    car_file_values = stated_values(scored.problem.nominal, name)
     others = found.indistinguishable.get(name, ())
     evidence = Evidence(
         held_out_error_reduction=1.0 - held_out.score(full) / max(held_out.score(error), 1e-12),

@@ -87,12 +87,13 @@ def accept_names(
     return NamingResult(found, residual, rival, vibration)
 
 
-def accept_given_names(
+def accept_requested_names(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, vibration: Vibration | None, control: RunControl
 ) -> NamingResult:
-    """Withdraw harmful effects of a search among given ones, and model the residual.
+    """Withdraw accepted effects that increase the held-out error, and model the residual.
 
-    Most of the catalogue was not searched, so unnamed physics says nothing about the accepted effects.
+    For a search among requested effects. Most of the catalogue was not searched, so unnamed physics is no evidence
+    against the accepted effects.
     """
     if found.effects and _increases_held_out_error(found, held_out):
         log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))

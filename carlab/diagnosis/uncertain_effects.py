@@ -52,8 +52,8 @@ def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> Scor
 def identity_distance(scored: ScoredSearch, effect: str) -> float:
     """Mahalanobis distance of the effect's numbers from those of the car file, or else from their identities.
 
-    It is that of the covariance of the fit. Infinite for an effect with a number without a finite identity, with a
-    number at the other end of its range, or with another form than in the car file.
+    The covariance is that of the fit. The distance is infinite for an effect with a number without a finite identity,
+    with a number at the other end of its range, or with another form than in the car file.
     """
     numbers = {f"effects.{effect}.{p.name}": p for p in EFFECTS[effect].parameters}
     is_stated = effect in scored.problem.nominal.effects

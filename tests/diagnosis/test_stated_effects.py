@@ -16,15 +16,16 @@ from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, E
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, verdict_sentence
-from carlab.diagnosis.report.write import completed
+from carlab.diagnosis.report.write import completed, with_parameter_std
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import DEFAULT
-from carlab.prediction.windows import cut_windows, segments_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CATALOGUE, CURVES, confusable_effects
+from sim_backends.effects import CATALOGUE, CURVES, EFFECTS, confusable_effects
 
+Table = dict[str, np.ndarray]
 TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
 """A quarter of the windows of the default."""
@@ -43,6 +44,13 @@ def nominal(case: Case, tmp_path: Path) -> SimulatorConfig:
     return load_car_file(tmp_path / "car.toml").simulator
 
 
+@pytest.fixture
+def windows(case: Case, tmp_path: Path) -> PredictionWindows:
+    write_csv(tmp_path / "drive.csv", case.fit)
+    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
+    return cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
+
+
 @pytest.fixture(autouse=True)
 def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search two effects only, because the whole catalogue takes long."""
@@ -50,14 +58,18 @@ def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", few)
 
 
-def diagnosed(case: Case, folder: Path, nominal: SimulatorConfig, angle_rad: float, stated_rad: float) -> Outcome:
-    """Diagnose drives that a camera system sees turned by an angle, where the car file states another angle."""
+def rotated(table: Table, angle_rad: float) -> Table:
+    """The same drive measured by a camera system with a yaw misalignment [rad]."""
     sin, cos = np.sin(angle_rad), np.cos(angle_rad)
+    vx, vy = table["vx"], table["vy"]
+    return table | {"yaw": table["yaw"] + angle_rad, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}
+
+
+def diagnosed(case: Case, folder: Path, nominal: SimulatorConfig, angle_rad: float, stated_rad: float) -> Outcome:
+    """Diagnose drives with a yaw misalignment, of which the car file states another value."""
     read = []
     for table in (case.fit, case.hold):
-        vx, vy = table["vx"], table["vy"]
-        turned = {"yaw": table["yaw"] + angle_rad, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}
-        write_csv(folder / "drive.csv", table | turned)
+        write_csv(folder / "drive.csv", rotated(table, angle_rad))
         read.append(list(import_csv(folder / "drive.csv").episodes))
     stated = replace(nominal, effects={MISALIGNMENT: {"angle": stated_rad}})
     return diagnose(*read, stated, TEXTS, settings=FEWER)
@@ -88,7 +100,7 @@ def test_stated_values_are_the_origin_of_every_effect(nominal: SimulatorConfig) 
     """Also of effects whose identity is infinite, and of values far outside the usual range."""
     for name in CATALOGUE:
         config = with_effect(nominal, name)
-        stated = {f"{f.name}": float(f.value(np.array(0.37))) for f in effect_parameters(name, nominal) if not f.choice}
+        stated = {f.name: float(f.value(np.array(0.37))) for f in effect_parameters(name, nominal) if not f.choice}
         config = config.with_values(stated)
         assert with_effect(config, name) is config
         for f in effect_parameters(name, config):
@@ -100,10 +112,7 @@ def test_stated_values_are_the_origin_of_every_effect(nominal: SimulatorConfig) 
     assert float(lag.value(np.array(0.0))) == 4.0
 
 
-def test_measured_curves_of_the_car_file_are_not_fitted(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
-    write_csv(tmp_path / "drive.csv", case.fit)
-    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
-    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
+def test_measured_curves_of_the_car_file_are_not_fitted(nominal: SimulatorConfig, windows: PredictionWindows) -> None:
     config = nominal
     for curve in CURVES:
         config = with_effect(config, curve.id)
@@ -152,7 +161,7 @@ def test_a_choice_of_the_car_file_is_the_origin(nominal: SimulatorConfig) -> Non
     assert "source is throttle, not force" in sentence
 
 
-def test_infinite_number_of_the_car_file_is_screened(nominal: SimulatorConfig) -> None:
+def test_infinite_number_of_the_car_file_has_a_finite_coordinate(nominal: SimulatorConfig) -> None:
     """``rate = inf`` states that the servo is not limited."""
     (rate,) = effect_parameters(
         "steering_rate_limit", replace(nominal, effects={"steering_rate_limit": {"rate": np.inf}})
@@ -161,11 +170,8 @@ def test_infinite_number_of_the_car_file_is_screened(nominal: SimulatorConfig) -
     assert np.isfinite(rate.value(np.array(0.0)))
 
 
-def test_tyre_curve_of_the_car_file_is_a_base_parameter(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
+def test_tyre_curve_of_the_car_file_is_a_base_parameter(nominal: SimulatorConfig, windows: PredictionWindows) -> None:
     """It replaces the tyres of the car file, so another floor changes its numbers."""
-    write_csv(tmp_path / "drive.csv", case.fit)
-    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
-    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
     linear = replace(nominal, kind="linear_tyre")
     problem = SearchProblem(with_effect(linear, "tyre_saturation"), windows, np.ones(6), np.ones(6), {})
     assert "effects.tyre_saturation.mu_front" in {f.name for f in problem.free_parameters(())}
@@ -173,26 +179,56 @@ def test_tyre_curve_of_the_car_file_is_a_base_parameter(case: Case, tmp_path: Pa
     assert SearchProblem(linear, windows, np.ones(6), np.ones(6), {}).is_candidate("tyre_saturation")
 
 
-@pytest.mark.parametrize(("name", "values", "better"), [
-    ("friction_ellipse", {"scale": 0.8, "action": 0.0}, {"scale": 0.4, "action": 0.0}),
-    ("low_friction_patch", {"x": 0.5, "y": 0.2, "radius": 0.8, "loss": 0.5},
-     {"x": 0.5, "y": 0.2, "radius": 0.8, "loss": 0.7}),
+@pytest.mark.parametrize(("name", "values", "number"), [
+    ("friction_ellipse", {"scale": 0.8, "action": 0.0}, "scale"),
+    ("low_friction_patch", {"x": 0.5, "y": 0.2, "radius": 0.8, "loss": 0.5}, "loss"),
 ])  # fmt: skip
 def test_screening_moves_stated_numbers_to_both_sides(
-    nominal: SimulatorConfig, case: Case, tmp_path: Path, name: str, values: dict[str, float], better: dict[str, float]
+    nominal: SimulatorConfig, windows: PredictionWindows, name: str, values: dict[str, float], number: str
 ) -> None:
     config = replace(nominal, effects={name: values})
-    write_csv(tmp_path / "drive.csv", case.fit)
-    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
-    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
-    steps = np.array([1, windows.steps])
-    fitter = Fitter(windows, Scale(steps, np.full((2, 6), 0.01)))
+    fitter = Fitter(windows, Scale(np.array([1, windows.steps]), np.full((2, 6), 0.01)))
     screen = Screen(fitter, config, Fit(config, (), np.zeros(0), 0.0, np.zeros(0)))
     free = effect_parameters(name, config)
-    points = screen.points(name, free)
-    for f, column in zip(free, points.T, strict=True):
-        if not f.choice and better[f.name.rpartition(".")[2]] != values[f.name.rpartition(".")[2]]:
-            assert (column * f.coordinate(better[f.name.rpartition(".")[2]]) > 0.0).any()
+    column = [f.name for f in free].index(f"effects.{name}.{number}")
+    coordinates = screen.points(name, free)[:, column]
+    assert coordinates.min() < 0.0 < coordinates.max()
+
+
+def test_stated_effect_that_a_curve_contains_is_omitted(nominal: SimulatorConfig, windows: PredictionWindows) -> None:
+    stated = {"throttle_deadband": {"width": 0.05}, MISALIGNMENT: {"angle": 0.02}}
+    problem = SearchProblem(replace(nominal, effects=stated), windows, np.ones(6), np.ones(6), {})
+    assert EFFECTS["throttle_deadband"].represented_by == "drive_map"
+    assert set(problem.config_with(("drive_map",)).effects) == {MISALIGNMENT, "drive_map"}
+    assert problem.config_with(("aerodynamic_drag",)).effects.items() >= stated.items()
+
+
+def test_model_has_the_standard_deviations_of_values_that_stay(nominal: SimulatorConfig) -> None:
+    model = replace(nominal, effects={"motor_lag": {"time_constant": 0.05}})
+    model = replace(model, parameter_std={"effects.motor_lag.time_constant": 0.004, "motor.drive_gain": 0.3})
+    fitted = {"motor.drive_gain": Estimate(8.0, 0.1, 7.8, 8.2, "N")}
+    diagnosis = Diagnosis("none", "", (), fitted, 1.0, {}, None, (), (), 0, 0.0)
+    assert with_parameter_std(diagnosis, model).parameter_std == {
+        "effects.motor_lag.time_constant": 0.004,
+        "motor.drive_gain": 0.1,
+    }
+
+
+@pytest.mark.parametrize("is_opposite", [False, True])
+def test_requested_effect_that_increases_the_held_out_error_is_withdrawn(
+    case: Case, tmp_path: Path, nominal: SimulatorConfig, is_opposite: bool
+) -> None:
+    """The held-out recording has the misalignment of the fitted one, or the opposite one.
+
+    The base parameters are known, so that a refit does not imitate the misalignment.
+    """
+    known = replace(nominal, parameter_std={f.name: 0.01 * f.origin for f in base_parameters(nominal) if f.logarithmic})
+    read = []
+    for table, angle_rad in ((case.fit, 0.06), (case.hold, -0.06 if is_opposite else 0.06)):
+        write_csv(tmp_path / "drive.csv", rotated(table, angle_rad))
+        read.append(list(import_csv(tmp_path / "drive.csv").episodes))
+    outcome = diagnose(*read, known, TEXTS, settings=FEWER, effects=(MISALIGNMENT,))
+    assert [effect.id for effect in outcome.diagnosis.effects] == ([] if is_opposite else [MISALIGNMENT])
 
 
 def test_sentence_counts_missing_and_wrong_effects_apart() -> None:

@@ -13,7 +13,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.drive_spread import part_blocks, parts_of
 from carlab.diagnosis.comparison.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.identification.fit import Fitter
-from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters
+from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, stated_effects
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
@@ -26,7 +26,7 @@ from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.windows import IndexArray, PredictionWindows, RecordingSegment, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CATALOGUE, confusable_effects
+from sim_backends.effects import confusable_effects
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +89,8 @@ def compared_groups(
     per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
     floor = np.sqrt(np.mean(per_step**2, axis=0))
     problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), (), settings)
-    stated = [name for name in nominal.effects if name in CATALOGUE]  # measured curves stay
     base = base_parameters(nominal, settings.identification)
-    free = (*base, *(f for name in stated for f in effect_parameters(name, nominal)))
+    free = (*base, *(f for name in stated_effects(nominal) for f in effect_parameters(name, nominal)))
     fitted = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
     limits = settings.comparison.max_windows
     one, two = (

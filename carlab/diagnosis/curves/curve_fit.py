@@ -79,8 +79,6 @@ def _fit(problem: SearchProblem, effects: tuple[str, ...], start: dict[str, floa
     free = problem.free_parameters(effects)
     z = np.array([start.get(f.name, 0.0) for f in free])
     config = problem.config_with(effects)
-    contained = {e for e in problem.nominal.effects if EFFECTS[e].represented_by in effects}
-    config = replace(config, effects={e: values for e, values in config.effects.items() if e not in contained})
     fit = None
     for count in iterations:
         values = {f.name: float(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}

@@ -11,7 +11,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from sim_backends.car_parameters import LATENCY, SimulatorConfig
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import CATALOGUE, EFFECTS
 from sim_backends.registry import REGISTRY
 
 BASE_PARAMETERS = (
@@ -132,11 +132,11 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
     A negative extra delay is at most the delay of the car file.
     """
     found = []
-    values = config.values()
+    values, stated_by_name = config.values(), stated_values(config, effect_id)
     for p in EFFECTS[effect_id].parameters:
         name = f"effects.{effect_id}.{p.name}"
         size = abs(p.typical) or 1.0
-        stated = stated_value(config, effect_id, p.name)
+        stated = stated_by_name.get(p.name)
         if p.choices:
             found.append(FitParameter(name, stated or 0.0, 1.0, 0.0, len(p.choices) - 1.0, choice=True))
         elif p.identity is not None and math.isinf(p.identity):
@@ -163,10 +163,17 @@ def tyre_effects(config: SimulatorConfig) -> tuple[str, ...]:
     )
 
 
-def stated_value(config: SimulatorConfig, effect_id: str, parameter: str) -> float | None:
-    """Value that the car file states for a parameter of an effect; None without the effect."""
-    stated = config.effects.get(effect_id)
-    return None if stated is None else float(config.values()[f"effects.{effect_id}.{parameter}"])
+def stated_effects(config: SimulatorConfig) -> tuple[str, ...]:
+    """Effects of the catalogue that the car file states, without measured curves and uncatalogued physics."""
+    return tuple(name for name in config.effects if name in CATALOGUE)
+
+
+def stated_values(config: SimulatorConfig, effect_id: str) -> dict[str, float]:
+    """Values by parameter that the car file states for an effect; empty without the effect."""
+    if effect_id not in config.effects:
+        return {}
+    values = config.values()
+    return {p.name: float(values[f"effects.{effect_id}.{p.name}"]) for p in EFFECTS[effect_id].parameters}
 
 
 def difference_steps(free: Sequence[FitParameter]) -> FloatArray:

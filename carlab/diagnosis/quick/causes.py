@@ -19,6 +19,7 @@ from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,
     effect_parameters,
+    stated_effects,
     with_effect,
 )
 from carlab.diagnosis.selection.problem import is_applicable
@@ -186,7 +187,7 @@ def _fit_with_refit(
     fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings
 ) -> tuple[_Candidate, list[_Candidate]]:
     """Refit all parameters, and add the effects with the best screening scores to the refit."""
-    own = [f for name in _adjustable(simulator) for f in effect_parameters(name, simulator)]
+    own = [f for name in stated_effects(simulator) for f in effect_parameters(name, simulator)]
     free = (*base_parameters(simulator), *own)
     refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=settings.fit_iterations)
     screen = Screen(fitter, simulator, refit, settings.screened_windows)
@@ -238,13 +239,8 @@ def _simulator_parameters(simulator: SimulatorConfig) -> list[tuple[str, tuple[F
     single = [(f.name, (f,)) for f in base]
     grip = tuple(f for f in base if f.name in GRIP_PARAMETERS)
     both = [(GRIP, grip)] if len(grip) == len(GRIP_PARAMETERS) else []
-    effects = [(f"effects.{name}", effect_parameters(name, simulator)) for name in _adjustable(simulator)]
+    effects = [(f"effects.{name}", effect_parameters(name, simulator)) for name in stated_effects(simulator)]
     return [*single, *both, *effects]
-
-
-def _adjustable(simulator: SimulatorConfig) -> list[str]:
-    """Effects of the catalogue in the simulator; measured curves and other physics stay as they are."""
-    return [name for name in simulator.effects if name in CATALOGUE]
 
 
 def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> FloatArray:

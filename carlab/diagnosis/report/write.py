@@ -131,8 +131,8 @@ def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> Simulato
         for name, found in estimates.items()
         if name in known and not REGISTRY[name].choices and 0.0 < found.std < math.inf and math.isfinite(known[name])
     }
-    kept = {name: std for name, std in model.parameter_std.items() if name in known and name not in estimates}
-    return replace(model, parameter_std=kept | parameter_std | _curve_std(diagnosis, known))
+    unchanged = {name: std for name, std in model.parameter_std.items() if name in known and name not in estimates}
+    return replace(model, parameter_std=unchanged | parameter_std | _curve_std(diagnosis, known))
 
 
 def _curve_std(diagnosis: Diagnosis, known: Mapping[str, float]) -> dict[str, float]:

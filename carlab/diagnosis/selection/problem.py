@@ -62,8 +62,14 @@ class SearchProblem:
         return Fitter(self.windows, scale, self.settings.identification)
 
     def config_with(self, effects: Sequence[str]) -> SimulatorConfig:
-        """The simulator with ``effects`` added, at the values of the car file or else at their identity values."""
-        config = self.nominal
+        """The simulator with ``effects`` added, at the values of the car file or else at their identity values.
+
+        An effect of the car file that one of the added curves contains is omitted.
+        """
+        stated = self.nominal.effects
+        config = replace(
+            self.nominal, effects={e: stated[e] for e in stated if EFFECTS[e].represented_by not in effects}
+        )
         for name in effects:
             config = with_effect(config, name)
         return config
