@@ -138,11 +138,11 @@ def test_standard_deviation_of_the_car_file_is_that_of_the_prior(nominal: Simula
 def test_car_that_changed_by_a_fifth_is_not_held_by_the_prior(
     case: Case, tmp_path: Path, nominal: SimulatorConfig
 ) -> None:
-    """The drive gain of the car file is a fifth too large, with a standard deviation of half a per cent."""
+    """The drive gain of the car file is a fifth too large, with a standard deviation of 0.01 per cent."""
     name = "motor.drive_gain"
     true = diagnosed(case, tmp_path, nominal, 0.0, 0.0).diagnosis.parameters[name].value
     wrong = nominal.with_values({name: 1.2 * true})
-    known = replace(wrong, parameter_std={name: 0.006 * true})
+    known = replace(wrong, parameter_std={name: 1e-4 * true})
     found = diagnosed(case, tmp_path, known, 0.0, 0.0).diagnosis
     assert found.effects == ()
     assert found.parameters[name].value == pytest.approx(true, rel=0.02)
