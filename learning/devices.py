@@ -6,15 +6,18 @@ tensors; the policy of a car runs on the CPU.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal, get_args
 
 import torch
+from torch import Tensor
 
 from carlab.core.errors import ConfigError
 
 DeviceName = Literal["cpu", "cuda"]
+CALLS_BEFORE_RECORDING = 3
+"""Calls of a function before its operations are recorded: the libraries of CUDA allocate their memory in them."""
 
 
 def available(name: str) -> str:
@@ -41,6 +44,11 @@ def synchronise(device: torch.device | str) -> None:
         torch.cuda.synchronize()
 
 
+def records_functions(device: torch.device | str) -> bool:
+    """Whether the operations of a function can be recorded on a device."""
+    return torch.device(device).type == "cuda" and torch.cuda.device_count() > 0
+
+
 @contextmanager
 def denormals_flushed() -> Iterator[None]:
     """Flush denormal numbers (below 1.2e-38 in float32) to zero in this context, as CUDA does.
@@ -55,4 +63,61 @@ def denormals_flushed() -> Iterator[None]:
         torch.set_flush_denormal(was)
 
 
-__all__ = ["DeviceName", "available", "denormals_flushed", "device_name", "synchronise"]
+class RecordedFunction:
+    """A function of CUDA tensors, recorded as a CUDA graph and replayed.
+
+    A replay starts all operations with one launch. For small tensors, one launch for each operation takes most of the
+    time of a call. The function may change tensors in place, but must not depend on numbers that change between calls
+    or copy to the CPU. See "CUDA Graphs" in the documentation of PyTorch.
+
+    Args:
+        function: of tensors of fixed shapes; returns tensors by name.
+    """
+
+    def __init__(self, function: Callable[..., dict[str, Tensor]]) -> None:
+        self._function = function
+        self._calls = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._inputs: list[Tensor] = []
+        self._outputs: dict[str, Tensor] = {}
+
+    def __call__(self, *inputs: Tensor) -> dict[str, Tensor]:
+        """Outputs of the function; the next call overwrites them."""
+        self._calls += 1
+        if self._calls <= CALLS_BEFORE_RECORDING:
+            return self._on_another_stream(inputs)
+        if self._graph is None:
+            self._record(inputs)
+        assert self._graph is not None
+        for own, given in zip(self._inputs, inputs, strict=True):
+            own.copy_(given)
+        self._graph.replay()
+        return self._outputs
+
+    def _on_another_stream(self, inputs: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Call the function on another stream than the default one, which cannot be recorded."""
+        stream, current = torch.cuda.Stream(), torch.cuda.current_stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(current)
+        with torch.cuda.stream(stream):
+            outputs = self._function(*inputs)
+        current.wait_stream(stream)
+        return outputs
+
+    def _record(self, inputs: tuple[Tensor, ...]) -> None:
+        """Record the operations, without running them."""
+        graph = torch.cuda.CUDAGraph()
+        self._inputs = [v.clone() for v in inputs]
+        with torch.cuda.graph(graph):
+            self._outputs = self._function(*self._inputs)
+        self._graph = graph
+
+
+__all__ = [
+    "DeviceName",
+    "RecordedFunction",
+    "available",
+    "denormals_flushed",
+    "device_name",
+    "records_functions",
+    "synchronise",
+]

@@ -42,8 +42,11 @@ class Adam:
         """Number of steps done."""
         return int(self._steps)
 
-    def step(self, gradient: Tensor, rate: float) -> None:
-        """Move the parameters against their gradient, a tensor of the same shape, by the learning rate ``rate``."""
+    def step(self, gradient: Tensor, rate: float | Tensor) -> None:
+        """Move the parameters against their gradient, a tensor of the same shape, by the learning rate ``rate``.
+
+        A rate in a CUDA tensor () may change between replays of a recorded step.
+        """
         self._steps += 1.0
         torch._fused_adamw_(
             [self.parameters], [gradient], [self.mean], [self.square], [], [self._steps],

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
+from learning.devices import RecordedFunction, records_functions
 from learning.networks.adam import Adam
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
@@ -167,7 +168,8 @@ def _train(
     particles, outputs = len(parameters), targets.mean.shape[1]
     layers, adam = network.split(parameters), Adam(parameters, second=SQUARE_DECAY)
     order = torch.randint(len(targets.inputs), (settings.steps, settings.sets), generator=generator)
-    for step, sets in enumerate(order.to(parameters.device)):
+
+    def train_step(sets: Tensor, rate: float | Tensor) -> dict[str, Tensor]:
         values, pullback = network.through(layers, targets.inputs[sets].flatten(0, 1))
         by_set = values.view(particles, settings.sets, settings.points, outputs)
         # Rows are pairs of set and output: (L, sets * outputs, points).
@@ -175,11 +177,25 @@ def _train(
         direction = moment_direction(rows, targets.mean[sets].flatten(0, 1), targets.cholesky[sets].flatten(0, 1))
         direction = direction * targets.weight[sets].flatten(0, 1)
         direction = direction.view(particles, settings.sets, outputs, settings.points)
-        gradient = -pullback(direction.transpose(2, 3).flatten(1, 2))
-        cosine = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
-        adam.step(gradient, settings.learning_rate * (FINAL_RATE_SHARE + (1.0 - FINAL_RATE_SHARE) * cosine))
+        adam.step(-pullback(direction.transpose(2, 3).flatten(1, 2)), rate)
+        return {}
+
+    rates = [_rate(step, settings) for step in range(settings.steps)]
+    replayed = RecordedFunction(train_step) if records_functions(parameters.device) else None
+    device_rates = torch.tensor(rates).to(parameters.device)
+    for step, sets in enumerate(order.to(parameters.device)):
+        if replayed is None:
+            train_step(sets, rates[step])
+        else:
+            replayed(sets, device_rates[step])
         if (step + 1) % PROGRESS_PERIOD_STEPS == 0:
             progress(step + 1)
+
+
+def _rate(step: int, settings: DistillationSettings) -> float:
+    """Learning rate of a step: a half cosine."""
+    cosine = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+    return settings.learning_rate * (FINAL_RATE_SHARE + (1.0 - FINAL_RATE_SHARE) * cosine)
 
 
 def measurement_points(
