@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
+INCOMPLETE_PAGE = "In the repository this page is incomplete: `make docs` writes the complete page to `build/site`.\n\n"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace each ``<!-- generated: NAME -->`` by its text; hide the markers that tests read."""
+    """Replace each ``<!-- generated: NAME -->`` by its text; hide markers of tests and the note for the repository."""
+    markdown = markdown.replace(INCOMPLETE_PAGE, "")
     for name, section in SECTIONS.items():
         marker = f"<!-- generated: {name} -->"
         if marker in markdown:

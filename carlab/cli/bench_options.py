@@ -60,8 +60,8 @@ class BenchOptions:
 
     ray: str = ""
     """Run the jobs on Ray in place of --jobs: local for the cores of this machine, or the address of a cluster with the
-    same version of carlab. If a worker dies, its job runs again; a job that fails does not end the others. Needs pip
-    install 'carlab[ray]'."""
+    same version of carlab. If a worker dies, its job runs again; a job that fails does not end the others. Needs the
+    extra ray of carlab (see "Run on a Ray cluster")."""
 
     methods: tuple[str, ...] = ()
     """regression, carlab's methods: gp-sim-posterior (a simulator with a Gaussian-process discrepancy), sim-posterior

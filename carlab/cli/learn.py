@@ -108,7 +108,8 @@ class Learn:
     """Train on Ray while the car stays with this computer: local, or the address of a cluster (ray://HOST:10001) with
     the same version of carlab, for example a computer with a GPU (--device cuda). While the cluster does not answer,
     the car stays in neutral and the run waits (--ray-wait). Then the run trains on this computer, and tries the cluster
-    again before the next episode. Needs pip install 'carlab[ray]'."""
+    again before the next episode. Needs the extra ray of carlab (see "Run on a Ray
+    cluster")."""
 
     ray_wait: float = RAY_WAIT_S
     """Time without an answer of the cluster after which a training runs on this computer [s]."""

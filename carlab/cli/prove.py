@@ -79,7 +79,8 @@ class Prove:
 
     ray: str = ""
     """Run the cases on Ray in place of --jobs: local for the cores of this machine, or the address of a cluster with
-    the same version of carlab. A case whose worker dies runs again. Needs pip install 'carlab[ray]'."""
+    the same version of carlab. A case whose worker dies runs again. Needs the extra ray of carlab (see
+    "Run on a Ray cluster")."""
 
     timeout: float = 1800.0
     """Time limit of a diagnosis [s]; a longer diagnosis counts as failed."""

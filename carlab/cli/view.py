@@ -31,8 +31,8 @@ PICTURE_FILE = "summary.png"
 class View:
     """Open a recording or a whole run in rerun, save it as .rrd, or save a picture of it.
 
-    A run has tabs: drive by episode, predicted against driven, learning curve, quick check, link. Tabs and panels
-    without data are left out.
+    A run has tabs: drive by episode, predicted against driven, learning curve, quick check, latency and health. Tabs
+    and panels without data are left out.
     """
 
     recording: Positional[Path]

@@ -16,6 +16,7 @@ from typing import Any
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.extras import install_hint
 from carlab.core.version import VERSION
 from carlab.jobs.child_jobs import ChildJob, JobEnd, run_job
 from carlab.jobs.child_processes import ChildEnd
@@ -92,7 +93,7 @@ class RayExecutor:
 def require_ray() -> None:
     """Raise ConfigError if Ray is not installed."""
     if importlib.util.find_spec("ray") is None:
-        raise ConfigError("--ray needs Ray, which is not installed; run: pip install 'carlab[ray]'.")
+        raise ConfigError(f"--ray needs Ray, which is not installed; {install_hint('ray')}.")
 
 
 def connect(address: str) -> Any:

@@ -19,7 +19,7 @@ from carlab.benchmark.world.measurement import read_csv
 from carlab.cars import load_car_file
 from carlab.core.errors import CarlabError, ConfigError
 
-pytest.importorskip("vehiclemodels", reason="commonroad-vehicle-models is not installed: pip install 'carlab[studies]'")
+pytest.importorskip("vehiclemodels", reason="commonroad-vehicle-models is not installed: pip install -e '.[studies]'")
 
 FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).with_name("fake_public_diagnosis.py")))
 MODELS: tuple[Model, ...] = ("multi_body", "drift")

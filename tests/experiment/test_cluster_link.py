@@ -90,7 +90,7 @@ def token(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextlib.contextmanager
 def cluster_of_ray(tmp_path: Path) -> Iterator[Cluster]:
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     ports = {name: free_port() for name in ("port", "ray-client-server-port", "dashboard-agent-listen-port")}
     command = ["ray", "start", "--head", "--block", "--num-cpus=2", "--node-ip-address=127.0.0.1"]
     command += ["--include-dashboard=false", "--disable-usage-stats"]

@@ -48,7 +48,7 @@ def test_view_shows_all_episodes_that_were_emitted(tmp_path: Path) -> None:
     for number, path in enumerate(run.recordings(), start=1):
         np.testing.assert_array_equal([v for n, v in rows if n == number], read_episode(path).states[:, 3])
     assert [cell for _, cell in cells(file, "TextLog:text", "car_time")["log"]] == [["learning the car"]]
-    assert set(tabs(file)) == {"Drive by episode", "Link"}
+    assert set(tabs(file)) == {"Drive by episode", "Latency and health"}
 
 
 def test_hanging_viewer_loses_documents_and_does_not_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,7 @@ FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).parents[1] / "benchmark" / 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[RayExecutor]:
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     with RayExecutor("local") as executor:
         yield executor
 
@@ -112,7 +112,7 @@ def test_proof_on_ray_has_the_reports_and_the_seal_of_a_proof_on_this_machine(
 
 
 def test_unreachable_cluster_is_refused_with_the_remedy() -> None:
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     for address in ("localhost:1", "ray://127.0.0.1:1"):
         with pytest.raises(ConfigError, match=r"no Ray cluster answers .* use --ray local"), RayExecutor(address):
             pass
@@ -126,7 +126,7 @@ def test_machine_with_another_version_is_refused(cluster: RayExecutor, monkeypat
 
 
 def test_cluster_without_a_gpu_is_refused() -> None:
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     program = "from carlab.jobs.ray_executor import RayExecutor\nRayExecutor('local', gpu=True).__enter__()"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     if done.returncode == 0:
@@ -145,5 +145,5 @@ def test_lost_cluster_ends_the_command_with_the_remedy(cluster: RayExecutor, mon
 
 def test_missing_ray_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'carlab\[ray\]'"):
+    with pytest.raises(ConfigError, match=r"pip install .* -e '\.\[ray\]'"):
         RayExecutor("local")

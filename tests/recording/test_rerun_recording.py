@@ -68,7 +68,7 @@ def test_live_recording_is_valid_and_has_the_entities_of_the_layout(tmp_path, ma
     assert entities(path) >= LIVE | STILL
     reader = RrdReader(str(path))
     assert len(reader.recordings()) == 1
-    assert sorted(tabs(path)) == ["Drive", "Link"]
+    assert sorted(tabs(path)) == ["Drive", "Latency and health"]
     assert {"Safety gate", "Health"} <= {view.name for view in views(path)}
 
 

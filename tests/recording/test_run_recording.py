@@ -102,7 +102,7 @@ def test_predictions_and_figures_are_written_with_their_bands(run_file: Path, me
 
 
 def test_layout_has_the_tabs_and_panels_with_data(run_file: Path, tmp_path: Path, make_documents) -> None:
-    learning = {"Drive by episode", "Predicted against driven", "Learning curve", "Quick check", "Link"}
+    learning = {"Drive by episode", "Predicted against driven", "Learning curve", "Quick check", "Latency and health"}
     assert set(tabs(run_file)) == learning
     names = [view.name for view in views(run_file)]
     assert {"Plan view [m]", "yaw rate [rad/s]", "Return", "Episodes", "What the quick check found"} <= set(names)
@@ -112,7 +112,7 @@ def test_layout_has_the_tabs_and_panels_with_data(run_file: Path, tmp_path: Path
         for document in make_documents(3):
             recording.write(document)
         send_blueprint(stream, recording.blueprint())
-    assert set(tabs(tmp_path / "drive.rrd")) == {"Drive by episode", "Link"}
+    assert set(tabs(tmp_path / "drive.rrd")) == {"Drive by episode", "Latency and health"}
 
 
 def test_number_of_an_episode_of_learning_is_that_of_its_model(tmp_path: Path, make_documents) -> None:

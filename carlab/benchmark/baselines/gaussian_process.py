@@ -13,6 +13,7 @@ import numpy as np
 from carlab.benchmark.baselines.data import Prepared, Steps, held_out_score
 from carlab.benchmark.world.simulation import FloatArray
 from carlab.core.errors import ConfigError
+from carlab.core.extras import install_hint
 
 POINTS = 400
 TUNED_ON = 150
@@ -25,7 +26,7 @@ def gp_score(data: Prepared) -> float:
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     except ImportError as error:
         raise ConfigError(
-            "The Gaussian process baseline needs scikit-learn: pip install 'carlab[studies]', or --no-baselines."
+            f"The Gaussian process baseline needs scikit-learn; {install_hint('studies')}. Or use --no-baselines."
         ) from error
     inputs = _inputs(data.steps)
     centre, spread = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)

@@ -18,6 +18,7 @@ from carlab.benchmark.baselines.data import Prepared, Steps, held_out_score
 from carlab.benchmark.baselines.terms import AT_END_ONLY, Term, effect_of, library
 from carlab.benchmark.world.simulation import FloatArray
 from carlab.core.errors import ConfigError
+from carlab.core.extras import install_hint
 
 THRESHOLDS = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
 MIN_SCORE_FALL = 0.03
@@ -77,7 +78,7 @@ def pysindy_regression(system: System) -> FloatArray:
         import pysindy
     except ImportError as error:
         raise ConfigError(
-            "The PySINDy baseline needs pysindy: pip install 'carlab[studies]', or --no-baselines."
+            f"The PySINDy baseline needs pysindy; {install_hint('studies')}. Or use --no-baselines."
         ) from error
     lengths = np.maximum(np.linalg.norm(system.fit_x, axis=0), 1e-9)
     unit = max(float(np.linalg.norm(system.fit_y)), 1e-9)

@@ -26,6 +26,7 @@ from carlab.benchmark.baselines.regression import (
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.simulation import FloatArray
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.extras import install_hint
 
 Outcome = tuple[str | None, float | None]
 BASELINES = ("refit only", "PySINDy", "GP residual", "stepwise BIC", "cross-correlation")
@@ -37,8 +38,8 @@ def require_studies() -> None:
     missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
     if missing:
         raise ConfigError(
-            f"The baselines need {' and '.join(missing)}: pip install 'carlab[studies]', or leave the baselines out "
-            "with --no-baselines."
+            f"The baselines need {' and '.join(missing)}; {install_hint('studies')}. Or leave the baselines out with "
+            "--no-baselines."
         )
 
 

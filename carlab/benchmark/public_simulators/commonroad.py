@@ -32,6 +32,7 @@ from carlab.benchmark.world.measurement import Noise, Recording, record
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, FloatArray
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.extras import install_hint
 
 Model = Literal["multi_body", "drift"]
 VEHICLE = 2  # BMW 320i, driven by its rear wheels
@@ -65,7 +66,7 @@ _TYRE_POWERS = {"p_vx1": -3.0}
 def require_public_simulator() -> None:
     """Raise ConfigError if the package is not installed."""
     if find_spec("vehiclemodels") is None:
-        raise ConfigError("The public simulator needs commonroad-vehicle-models: pip install 'carlab[studies]'.")
+        raise ConfigError(f"The public simulator needs commonroad-vehicle-models; {install_hint('studies')}.")
 
 
 def parameters(scale: float = SCALE) -> Any:

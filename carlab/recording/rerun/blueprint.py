@@ -141,7 +141,11 @@ def link_tab(logged: Logged = None) -> rrb.Container | None:
     """Tab of latencies, health and log; None without data."""
     health = rrb.TimeSeriesView(origin=f"/{HEALTH}", name="Health") if has(logged, HEALTH) else None
     figures = stack(rrb.Vertical, [(_latency(logged), 1), (health, 1)])
-    return None if figures is None else stack(rrb.Horizontal, [(figures, 1), (_texts("Log", logged), 1)], "Link")
+    return (
+        None
+        if figures is None
+        else stack(rrb.Horizontal, [(figures, 1), (_texts("Log", logged), 1)], "Latency and health")
+    )
 
 
 def has(logged: Logged, *paths: str) -> bool:

@@ -164,7 +164,7 @@ class RunRecording:
             self.documents.text(CHECK, f"Episode {episode}: {check}")
 
     def blueprint(self, *, is_learning: bool | None = None) -> rrb.Blueprint:
-        """Layout of tabs: drive by episode, predicted against driven, learning curve, quick check, link.
+        """Layout of tabs: drive by episode, predicted against driven, learning curve, quick check, latency and health.
 
         Args:
             is_learning: whether a live view must show learning; None: the tabs and panels with data.
