@@ -11,7 +11,7 @@ import numpy as np
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
-from carlab.diagnosis.identification.fit_parameters import stated_values
+from carlab.diagnosis.identification.fit_parameters import FitParameter, stated_values
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
@@ -44,6 +44,7 @@ class ScoredSearch:
     fit      fit with the accepted effects, with covariance
     errors   held-out errors (S, 6) of the models nominal, refit and with_effects, in SI units
     is_joint whether initial states were fitted together with the parameters of ``fit``
+    excess   share of the error with effects that is not noise, ``sqrt(1 - 1 / score^2)``; 0 in a joint fit
     """
 
     problem: SearchProblem
@@ -52,6 +53,7 @@ class ScoredSearch:
     fit: Fit
     errors: Mapping[str, FloatArray]
     is_joint: bool = False
+    excess: float = 0.0
 
     @classmethod
     def of(cls, problem: SearchProblem, found: SearchResult, held_out: HeldOut) -> ScoredSearch:
@@ -63,7 +65,9 @@ class ScoredSearch:
             "with_effects": held_out.final_error(found.best.config),
         }
         fit = found.best if is_joint else problem.fitter(found.scale).with_covariance(found.best)
-        return cls(problem, found, held_out, fit, errors_of, is_joint)
+        score = held_out.score(errors_of["with_effects"])
+        excess = 0.0 if is_joint else math.sqrt(max(1.0 - 1.0 / max(score, 1.0) ** 2, 0.0))
+        return cls(problem, found, held_out, fit, errors_of, is_joint, excess)
 
     def scores(self) -> dict[str, float]:
         """Held-out score of each model, in noise floors."""
@@ -173,11 +177,22 @@ def estimate(scored: ScoredSearch, name: str) -> Estimate:
     min_relative_std = settings.joint_min_relative_std if scored.is_joint else settings.min_relative_std
     std_z = factor * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
     low, value, high = (float(free.value(np.array(z + k * std_z))) for k in (-z90, 0.0, z90))
-    margin = z90 * min_relative_std * abs(value)
+    margin = z90 * math.hypot(min_relative_std * abs(value), _model_error_std(scored, free, value))
     low = max(value - math.hypot(value - min(low, high), margin), free.low)
     high = min(value + math.hypot(max(low, high) - value, margin), free.high)
     at_limit = not free.choice and value in (free.low, free.high)
     return Estimate(value, (high - low) / (2 * z90), low, high, REGISTRY[name].unit, at_limit)
+
+
+def _model_error_std(scored: ScoredSearch, free: FitParameter, value: float) -> float:
+    """Standard deviation of an effect's number due to the error of the model; 0 for other parameters.
+
+    It is a share of the distance from the identity (0 if that is infinite) or from the car file, times ``excess``.
+    """
+    if not free.name.startswith("effects."):
+        return 0.0
+    reference = 0.0 if free.logarithmic else float(free.value(np.array(0.0)))
+    return scored.problem.settings.evidence.model_error_share * abs(value - reference) * scored.excess
 
 
 def base_estimates(scored: ScoredSearch) -> dict[str, Estimate]:
