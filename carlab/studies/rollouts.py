@@ -151,7 +151,8 @@ def _fit_without_fold(
 
     Curves of a fold are fitted once, for all seeds.
     """
-    fold_of_row = _folds_of_rows(case, episodes[0].period_s)
+    assert case.rows is not None
+    fold_of_row = folds_of_rows(case.rows, episodes)
     dense_windows = recorded_windows(episodes, max(HORIZONS_S), FIT_STRIDE_S)
 
     @functools.cache
@@ -196,7 +197,7 @@ def _episodes_without_fold(episodes: Sequence[EpisodeData], fold: int | None) ->
         return list(episodes)
     parts: list[EpisodeData] = []
     for number, episode in enumerate(episodes):
-        t_s = episode.period_s * np.arange(episode.ticks, dtype=np.float64)
+        t_s = episode.times_s[:-1] - episode.times_s[0]
         parts += unbroken_parts(episode, folds(np.full(episode.ticks, number), t_s) != fold)
     return parts
 
@@ -217,7 +218,8 @@ def checked_counts(
     counts = tuple(rows) or ((ALL_ROWS,) if with_curves else COUNTS)
     if with_curves and any(count != ALL_ROWS for count in counts):
         raise ConfigError("Measured curves are fitted to whole recordings, not to random rows; use --rows all.")
-    fold_of_row = _folds_of_rows(case, recordings[0][0].period_s)
+    assert case.rows is not None
+    fold_of_row = folds_of_rows(case.rows, [episode for recording in recordings[:-1] for episode in recording])
     smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
     largest = max((count for count in counts if count != ALL_ROWS), default=0)
     if largest > smallest:
@@ -225,9 +227,13 @@ def checked_counts(
     return counts
 
 
-def _folds_of_rows(case: RecordedCase, period_s: float) -> np.ndarray:
-    assert case.rows is not None
-    return folds(case.rows.episode, case.rows.tick * period_s)
+def folds_of_rows(rows: Transitions, episodes: Sequence[EpisodeData]) -> np.ndarray:
+    """Fold (n,) of rows of episodes by their recorded times, as of windows: a recording may have gaps."""
+    t_s = np.empty(len(rows))
+    for number, episode in enumerate(episodes):
+        own = rows.episode == number
+        t_s[own] = episode.times_s[rows.tick[own]] - episode.times_s[0]
+    return folds(rows.episode, t_s)
 
 
 def fit_rows(
@@ -331,6 +337,7 @@ __all__ = [
     "fit_rows",
     "fold_errors",
     "folds",
+    "folds_of_rows",
     "run_rollout_study",
     "scores_from_json",
     "scores_of",

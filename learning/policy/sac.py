@@ -152,6 +152,19 @@ class FastSac(SAC):
             for name, own in self.learned_state().items()
         }
 
+    def layers_of(self, name: str, value: Tensor) -> list[Tensor]:
+        """Weights (L, in, out) and biases (L, 1, out) in a moment (L, P) of ``learned_state``, as views.
+
+        Args:
+            name: of the entry of the state; for one that is no moment of a network, the list has the value itself.
+            value: the entry.
+        """
+        group, _, entry = name.partition("/")
+        networks = {"actor": self._actor.network, "critics": self._critics.network}
+        if group not in networks or entry not in ("mean", "square"):
+            return [value]
+        return [v for layer in networks[group].split(value) for v in layer]
+
     def _adams(self) -> dict[str, Adam]:
         return {"actor": self._actor.adam, "critics": self._critics.adam, "temperature": self._temperature}
 

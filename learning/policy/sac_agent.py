@@ -174,11 +174,15 @@ class SacAgent:
         if observation_size <= width:
             return
         wider = _without_environment(observation_size, self._settings, self._seed)
-        state = self._sac.learned_state()
-        wider.load_learned_state({
-            name: _with_zeros(value, own) if isinstance(own, Tensor) and isinstance(value, Tensor) else value
-            for (name, own), value in zip(wider.learned_state().items(), state.values(), strict=True)
-        })  # fmt: skip
+        state, wider_state = self._sac.learned_state(), wider.learned_state()
+        for name, value in state.items():
+            target = wider_state[name]
+            if isinstance(value, Tensor) and isinstance(target, Tensor):
+                for old, new in zip(self._sac.layers_of(name, value), wider.layers_of(name, target), strict=True):
+                    new.copy_(_with_zeros(old, new))
+            else:
+                wider_state[name] = value
+        wider.load_learned_state(wider_state)
         self._sac = wider
 
     def save(self, folder: Path) -> None:

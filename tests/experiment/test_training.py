@@ -145,7 +145,7 @@ def test_too_short_episode_gives_no_training_rows(tmp_path: Path) -> None:
     assert list(dict.fromkeys(stages)) == ["reading the recordings", "learning the car", "learning to drive"]
 
 
-def test_model_env_has_a_larger_stopping_margin_and_a_parking_bonus(
+def test_training_has_a_larger_stopping_margin_and_a_parking_bonus_and_the_prediction_has_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At 2 m/s the geofence needs 0.97 m; with this margin alone a policy is stopped as soon as the car slides more."""
@@ -162,9 +162,10 @@ def test_model_env_has_a_larger_stopping_margin_and_a_parking_bonus(
     train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
     edge_m = max(x for x, _ in ENVELOPE.arena_m)
     history = np.zeros((HISTORY, 2))
-    training_env, evaluation_env, _drawn_cars = envs
-    for env in (training_env, evaluation_env):
-        for margin_m, stopped in ((1.1, True), (1.4, False)):
+    training_env, evaluation_env, prediction_env, _drawn_cars = envs
+    for env in (training_env, evaluation_env, prediction_env):
+        # The predicted return is that of the real car's gate.
+        for margin_m, stopped in ((1.1, env is not prediction_env), (1.4, False)):
             state = CarState(edge_m - margin_m, 0.0, 0.0, 2.0, 0.0, 0.0)
             assert can_stop_inside(ENVELOPE.arena_m, state, ENVELOPE.reaction_s, ENVELOPE.deceleration_mps2)
             row = torch.from_numpy(encode(state.to_array()[None], history[None])).float()
@@ -172,7 +173,8 @@ def test_model_env_has_a_larger_stopping_margin_and_a_parking_bonus(
     features = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
     assert training_env._bonus is not None
     assert training_env._bonus(features).tolist() == pytest.approx([SUCCESS_BONUS, 0.0])
-    assert evaluation_env._bonus is None, "the predicted return is the task's reward alone"
+    assert evaluation_env._bonus is None
+    assert prediction_env._bonus is None, "the predicted return is the task's reward alone"
 
 
 def test_training_accepts_an_episode_without_a_tick(tmp_path: Path) -> None:

@@ -280,6 +280,26 @@ def test_agent_of_another_shape_is_refused(saved: Path, kind: str) -> None:
         SacAgent.load(saved, settings, 0).train(env, 32)
 
 
+def test_moments_of_a_widened_agent_stay_with_their_weights() -> None:
+    """Each first-layer moment of a wider agent is that of the same input; moments of new inputs are 0."""
+    agent = SacAgent(SMALL, 0)
+    agent.train(ModelEnv(ConstantChange(), SignTask(), 16), 0)
+    narrow = agent.policy().sac
+    state = narrow.learned_state()
+    inputs = 7 + 2 * HISTORY
+    for name, width in (("actor", inputs), ("critics", inputs + 2)):
+        weights = narrow.layers_of(f"{name}/mean", state[f"{name}/mean"])[0]
+        weights.copy_(torch.arange(1.0, width + 1.0)[None, :, None].expand_as(weights))
+    narrow.load_learned_state(state)
+    agent.widen(inputs + 4)
+    wide = agent.policy().sac
+    for name, width in (("actor", inputs), ("critics", inputs + 2)):
+        weights = wide.layers_of(f"{name}/mean", wide.learned_state()[f"{name}/mean"])[0]
+        expected = [*range(1, 8), 0, 0, 0, 0, *range(8, width + 1)]
+        assert weights.shape[1] == len(expected)
+        torch.testing.assert_close(weights, torch.tensor(expected).float()[None, :, None].expand_as(weights))
+
+
 def test_agent_with_more_past_commands_acts_as_before_and_learns(tmp_path: Path) -> None:
     trained_agent = SacAgent(SMALL, 0)
     trained_agent.train(ModelEnv(ConstantChange(), SignTask(), 16), 8)

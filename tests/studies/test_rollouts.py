@@ -13,8 +13,9 @@ from linear_cars import linear_car
 import carlab.studies.rollouts as study
 from carlab.cli import run
 from carlab.core.episode_data import EpisodeData
-from carlab.studies.rollouts import DISTURBED, INDEPENDENT, energy_score, folds
-from learning.transitions import Transitions
+from carlab.prediction.learned import recorded_windows
+from carlab.studies.rollouts import DISTURBED, INDEPENDENT, energy_score, folds, folds_of_rows
+from learning.transitions import Transitions, transitions_of
 from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import DisturbanceProcess
 from learning.world.drive_windows import DriveWindows
@@ -121,6 +122,27 @@ def test_energy_score_of_a_gaussian_is_the_closed_form() -> None:
     density, below = math.exp(-0.5 * z**2) / math.sqrt(2 * math.pi), 0.5 * (1 + math.erf(z / math.sqrt(2)))
     crps = 2.0 * (z * (2 * below - 1) + 2 * density - 1 / math.sqrt(math.pi))
     assert energy_score(errors) == pytest.approx(crps, rel=0.05)
+
+
+def test_no_row_of_a_fit_lies_in_a_held_out_window_of_a_recording_with_a_gap() -> None:
+    """Rows and windows of a recording that paused for 25 s have the folds of the same recorded times."""
+    first, second = drive(SimulatorConfig(), 60.0, 3), drive(SimulatorConfig(), 60.0, 4)
+    gap = EpisodeData(
+        np.concatenate([first.times_s[:-1], second.times_s + first.times_s[-1] + 25.0]),
+        np.concatenate([first.states[:-1], second.states]),
+        *(np.concatenate([first.sent, second.sent]),) * 2, np.zeros(first.ticks + second.ticks),
+    )  # fmt: skip
+    rows, windows = transitions_of([gap], 3), recorded_windows([gap], 1.0, 0.25)
+    t_s = gap.times_s[rows.tick] - gap.times_s[0]
+    of_rows = folds_of_rows(rows, [gap])
+    starts, ends = folds(windows.recording, windows.t0_s), folds(windows.recording, windows.t0_s + 1.0)
+    checked = 0
+    for fold in range(3):
+        for start_s in windows.t0_s[(starts == fold) & (ends == fold)]:
+            inside = (t_s >= start_s) & (t_s < start_s + 1.0)
+            assert (of_rows[inside] == fold).all()
+            checked += 1
+    assert checked > 100
 
 
 def test_folds_are_blocks_of_time_in_turn() -> None:
