@@ -219,6 +219,10 @@ class HardwareCar(Car):
             self._newest = sample
 
     def _pose_problems(self) -> list[str]:
+        """Reasons not to arm: no fresh tracked pose, and the problems that the pose source reports."""
+        return [*self._missing_pose(), *self.pose_source.problems()]
+
+    def _missing_pose(self) -> list[str]:
         newest = self.pose_source.latest()
         if newest is None:
             return ["motion capture has sent no pose yet; check its software, the network and the body's id."]

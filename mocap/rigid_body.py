@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import takewhile
 from typing import Self
 
@@ -19,8 +19,12 @@ from mocap.natnet_client import NatNetClient
 MAX_SAMPLES = 1024
 NORM_TOLERANCE = 0.01
 TILT_LIMIT_RAD = math.radians(40.0)
-TILTED_SHARE = 0.2
 HEIGHT_LIMIT_M = 0.3
+RECENT_FRAMES = 60
+"""Number of newest frames in which tilted and invalid poses are counted: half a second at 120 Hz, so that a car that
+was carried can be armed soon after it stands level again."""
+RECENT_SHARE = 0.2
+"""Share of the recent frames that may be tilted, or invalid, by single errors of tracking [1]."""
 
 
 class RigidBodyPoseSource:
@@ -42,7 +46,9 @@ class RigidBodyPoseSource:
         self._clear_counts()
 
     def _clear_counts(self) -> None:
-        self._tracked = self._untracked = self._missing = self._unusable = self._tilted = 0
+        self._tracked = self._untracked = self._missing = self._unusable = 0
+        self._recent_tilted: deque[bool] = deque(maxlen=RECENT_FRAMES)
+        self._recent_unusable: deque[bool] = deque(maxlen=RECENT_FRAMES)
         self._low_m = [math.inf] * 3
         self._high_m = [-math.inf] * 3
 
@@ -115,31 +121,47 @@ class RigidBodyPoseSource:
         return numbers
 
     def problems(self) -> tuple[str, ...]:
-        """Suspected problems while poses arrive, as sentences with remedies; empty if there are none."""
+        """Suspected problems while poses arrive, as sentences with remedies; empty if there are none.
+
+        The sentences of a lasting problem do not change from frame to frame.
+        """
         found = []
         if self._client.failure is not None:
             found.append(f"motion capture stopped, {self._client.last_error}; close it and open it again.")
         with self._new_sample:
-            spans_m = [high - low for low, high in zip(self._low_m, self._high_m, strict=True)]
-            other = "z" if self.config.up_axis == "y" else "y"
-            if self._tracked and self._tilted > TILTED_SHARE * self._tracked:
-                found.append(
-                    f"the body '{self._body_name}' is tilted by more than {math.degrees(TILT_LIMIT_RAD):.0f} degrees "
-                    f'in {self._tilted} of {self._tracked} frames: up_axis = "{other}" may be right in '
-                    "[hardware.mocap] (listen: --up-axis), or the body was not level when it was created in Motive."
-                )
-            elif self._tracked and spans_m[2] > HEIGHT_LIMIT_M and min(spans_m[:2]) < 0.1 * spans_m[2]:
-                found.append(
-                    f"the body '{self._body_name}' moves vertically by {spans_m[2]:.2f} m and hardly horizontally: "
-                    f'up_axis = "{other}" may be right in [hardware.mocap] (listen: --up-axis).'
-                )
+            found += self._axis_problems()
             if self._body is None and self._is_open:
                 found.append("the server no longer has the body; define it again in Motive under the same name.")
-            if self._unusable:
-                found.append(f"{self._unusable} frames had an invalid pose of the body (NaN or no unit quaternion).")
-        if self._is_open and not self._client.alignment.is_aligned:
+            if _share(self._recent_unusable) > RECENT_SHARE:
+                found.append(
+                    f"more than {RECENT_SHARE:.0%} of the newest frames have an invalid pose of the body (NaN or no "
+                    "unit quaternion); restart streaming in Motive."
+                )
+        info = self._client.server_info
+        has_clock = info is not None and info.clock_hz > 0
+        if self._is_open and has_clock and not self._client.alignment.is_aligned:
             found.append("the server answers no clock echo, so capture times are times of arrival; check the firewall.")
         return tuple(found)
+
+    def _axis_problems(self) -> list[str]:
+        """Signs of a wrong vertical axis: a tilted body, or one that moves in a vertical plane.
+
+        With the wrong axis the real height of the body, which is constant, is the y coordinate in ``map``.
+        """
+        other = "z" if self.config.up_axis == "y" else "y"
+        remedy = f'up_axis = "{other}" may be right in [hardware.mocap] (listen: --up-axis)'
+        if _share(self._recent_tilted) > RECENT_SHARE:
+            return [
+                f"the body '{self._body_name}' is tilted by more than {math.degrees(TILT_LIMIT_RAD):.0f} degrees: "
+                f"{remedy}, or the body was not level when it was created in Motive."
+            ]
+        _, y_span_m, z_span_m = (high - low for low, high in zip(self._low_m, self._high_m, strict=True))
+        if self._tracked and z_span_m > HEIGHT_LIMIT_M and y_span_m < 0.1 * z_span_m:
+            return [
+                f"the body '{self._body_name}' has moved vertically by more than {HEIGHT_LIMIT_M:g} m and hardly in y: "
+                f"{remedy}; if the car was lifted, move it by {HEIGHT_LIMIT_M:g} m in y."
+            ]
+        return []
 
     def close(self) -> None:
         """Disconnect; samples stay readable. Idempotent, safe after a failed open."""
@@ -184,6 +206,8 @@ class RigidBodyPoseSource:
 
     def _sample(self, body: RigidBody | None, sequence: int, capture_s: float, received_s: float) -> PoseSample | None:
         pose = None if body is None else self._pose(body)
+        if body is not None and body.is_tracked:
+            self._recent_unusable.append(pose is None)
         if body is None:
             self._missing += 1
         elif not body.is_tracked:
@@ -216,9 +240,14 @@ class RigidBodyPoseSource:
         quaternion: Quaternion = (body.qx / norm, body.qy / norm, body.qz / norm, body.qw / norm)
         if self.config.up_axis == "y":
             position, quaternion = z_up_vector(position), z_up_quaternion(quaternion)
-        if body.is_tracked and tilt_rad(quaternion) > TILT_LIMIT_RAD:
-            self._tilted += 1
+        if body.is_tracked:
+            self._recent_tilted.append(tilt_rad(quaternion) > TILT_LIMIT_RAD)
         return base_link_pose(position, quaternion, self.config.yaw_offset_rad, self.config.pivot_in_base_link_m)
+
+
+def _share(flags: Collection[bool]) -> float:
+    """Share of true flags [1]; 0 without flags."""
+    return sum(flags) / len(flags) if flags else 0.0
 
 
 def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBodyDescription:

@@ -9,7 +9,7 @@ from typing import Literal
 from rich.text import Text
 
 from carlab.api.arguments import above_zero
-from carlab.cli.console import console, table
+from carlab.cli.console import console, fail, table
 from carlab.core.errors import ConfigError
 
 
@@ -51,7 +51,7 @@ class Listen:
     """Show the whole log."""
 
     def run(self) -> int:
-        """Print four frames per second, then the statistics."""
+        """Print four frames per second and new problems of the poses, then the statistics and the last problems."""
         from carlab.cars import load_car_file
         from carlab.core.clock import MonotonicClock
         from carlab.experiment.episodes.interrupts import Interrupts
@@ -78,6 +78,7 @@ class Listen:
         with Interrupts() as interrupts, RigidBodyPoseSource(config) as source:
             end_s = float("inf") if self.seconds is None else clock.now_s() + self.seconds
             sequence = -1
+            shown: set[str] = set()
             while not interrupts.requested.is_set() and clock.now_s() < end_s:
                 sample = source.wait_for(sequence, 0.5)
                 if sample is None:
@@ -90,8 +91,15 @@ class Listen:
                     f"yaw {sample.yaw_rad:+7.4f} rad  latency {age_ms:5.1f} ms",
                     Text("" if sample.tracked else " not tracked", "yellow"),
                 )
+                problems = source.problems()
+                for problem in problems:
+                    if problem not in shown:
+                        fail(problem)
+                shown.update(problems)
                 clock.sleep_until(min(clock.now_s() + 0.25, end_s))
-            statistics = source.statistics()
+            statistics, problems = source.statistics(), source.problems()
         rows = [[name.replace("_", " "), f"{value:.4g}"] for name, value in statistics.items()]
         table("Stream", ["figure", "value"], rows)
+        for problem in problems:
+            fail(problem)
         return 0

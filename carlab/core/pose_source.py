@@ -27,6 +27,12 @@ class PoseSource(Protocol):
     def statistics(self) -> Mapping[str, float]:
         """Rates, losses and latencies; the names end in their units."""
 
+    def problems(self) -> tuple[str, ...]:
+        """Reasons not to trust the poses that arrive (a wrong axis, invalid poses ...), as sentences with remedies.
+
+        Empty if there are none. Never blocks.
+        """
+
     def close(self) -> None:
         """Disconnect. Idempotent, and safe after a failed open."""
 

@@ -109,6 +109,28 @@ def test_malformed_frames_are_counted_and_ignored(carlab: Carlab, tmp_path: Path
     assert "malformed" in text
 
 
+def test_wrong_up_axis_is_reported_and_prevents_driving(carlab: Carlab, tmp_path: Path, world: World) -> None:
+    with world:
+        world.answer({"do": "place", "state": [0.0, 0.0, 1.2, 0.0, 0.0, 0.0]})
+        addresses = world.addresses
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"], 'body = "car"\nup_axis = "y"')
+        code, text = carlab("check", "--car", path, "--seconds", "0.5")
+        assert (code, "Ready." in text) == (0, True), text
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"], 'body = "car"\nup_axis = "z"')
+        code, text = carlab("check", "--car", path, "--seconds", "0.5")
+        assert code == 3
+        assert "Not ready." in text
+        assert 'up_axis = "y" may be right' in text
+        options = ["--no-place", "--no-rerun", "--ticks", "10", "--policy", "slow_circle"]
+        code, text = carlab("drive", "--car", path, *options, "--out", tmp_path / "runs")
+        assert code == 3
+        assert 'up_axis = "y" may be right' in text
+        assert all(entry.value == 0.0 for entry in world.log.motor()), "no moving command has reached the firmware"
+        code, text = carlab("listen", "--car", path, "--seconds", "0.5")
+        assert code == 0
+        assert 'up_axis = "y" may be right' in text
+
+
 @pytest.mark.parametrize(
     ("table", "parts"),
     [

@@ -37,6 +37,7 @@ class ScriptedPoses:
     def __init__(self) -> None:
         self.samples: list[PoseSample] = []
         self.failure: NotReadyError | None = None
+        self.reported: tuple[str, ...] = ()
         self.n_delayed = 0
         self.closes = 0
 
@@ -69,6 +70,9 @@ class ScriptedPoses:
 
     def statistics(self) -> Mapping[str, float]:
         return {"rate_hz": 120.0}
+
+    def problems(self) -> tuple[str, ...]:
+        return self.reported
 
     def close(self) -> None:
         self.closes += 1
@@ -186,6 +190,23 @@ def test_arming_waits_for_late_poses(car: HardwareCar, poses: ScriptedPoses) -> 
     car.arm()
     assert poses.n_delayed == 1, "a speed estimate needs three poses"
     assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
+
+
+def test_problem_of_the_pose_source_prevents_arming(
+    car: HardwareCar, poses: ScriptedPoses, serial_firmware: SerialFirmware
+) -> None:
+    poses.show_at_rest()
+    poses.reported = ("the body is tilted; change up_axis.",)
+    assert car.health().problems == poses.reported
+    with pytest.raises(NotReadyError, match=r"the body is tilted; change up_axis\."):
+        car.arm()
+    with pytest.raises(NotArmedError):
+        car.command(Action(0.1, 0.1))
+    assert all(entry.value == 0.0 for entry in serial_firmware.log.motor())
+    poses.reported = ()
+    poses.show_at_rest()
+    assert car.health().ready
+    car.arm()
 
 
 def test_car_without_measured_motor_speed_is_not_armed(

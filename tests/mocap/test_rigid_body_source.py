@@ -24,6 +24,7 @@ from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
 from mocap.emulators.scene import EmulatedBody, RigidBodySample
+from mocap.natnet.codec import MessageId
 from mocap.natnet.models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription
 from mocap.natnet.sockets import udp_socket
 from mocap.rigid_body import RigidBodyPoseSource, select_body
@@ -116,6 +117,41 @@ def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Un
         assert 'up_axis = "y"' in source.problems()[0]
 
 
+def test_carried_car_is_no_problem_once_it_stands_level(serve: Serve, configure: Configure, until: Until) -> None:
+    tilts_deg, height_m, y_m = [60.0], [0.0], [0.0]
+
+    def carried(t_s: float) -> list[RigidBodySample]:
+        quaternion = tuple(Rotation.from_euler("x", tilts_deg[0], degrees=True).as_quat())
+        return [RigidBodySample(t_s, (0.0, y_m[0], height_m[0]), quaternion)]
+
+    with RigidBodyPoseSource(configure(serve(carried))) as source:
+        until(lambda: any("tilted" in text for text in source.problems()))
+        tilts_deg[0] = 0.0
+        until(lambda: source.problems() == ())
+        height_m[0] = 0.5
+        until(lambda: any("vertically" in text for text in source.problems()))
+        y_m[0] = 0.3
+        until(lambda: source.problems() == ())
+
+
+class ServerWithoutEcho(NatNetServer):
+    """A server whose answers to clock echoes are lost."""
+
+    def _answer(self, message_id: int, payload: bytes, address: Any, now_s: float) -> tuple[int, bytes] | None:
+        return None if message_id == MessageId.ECHOREQUEST else super()._answer(message_id, payload, address, now_s)
+
+
+def test_missing_clock_echo_is_a_problem_of_a_server_with_a_clock_only(
+    serve: Serve, configure: Configure, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with RigidBodyPoseSource(configure(serve(kind=ServerWithoutEcho), timeout_s=0.5)) as source:
+        (text,) = source.problems()
+        assert "clock echo" in text
+    monkeypatch.setattr("mocap.emulators.natnet_server.CLOCK_HZ", 0)
+    with RigidBodyPoseSource(configure(serve(kind=ServerWithoutEcho), timeout_s=0.5)) as source:
+        assert source.problems() == ()
+
+
 @pytest.mark.parametrize("version", ["3.0", "4.1"])
 def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, until: Until, version: str) -> None:
     """The x of a pose encodes its true time of exposure on the host's monotonic clock."""
@@ -189,7 +225,11 @@ def test_invalid_pose_is_not_tracked(serve: Serve, configure: Configure, until: 
         until(lambda: source.statistics()["unusable"] > count + 3.0)
         assert pose(source.latest()) == pytest.approx((1.0, 2.0, 0.0, 0.0), abs=1e-6)
         assert not source.latest().tracked  # type: ignore[union-attr]
+        until(lambda: bool(source.problems()))
         assert "invalid pose" in source.problems()[0]
+        place[0] = (1.0, 2.0, 0.0)
+        until(lambda: source.problems() == ())
+        assert source.statistics()["unusable"] > count, "past invalid frames stay counted"
 
 
 def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configure: Configure, until: Until) -> None:
