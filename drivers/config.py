@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from carlab.core.errors import ConfigError
+from carlab.core.safety_bounds import SAFETY_BOUNDS, check_bound
 from drivers.calibration import ActuatorCalibration
 from drivers.device_kinds import DEVICE_KINDS, DeviceKind
 
@@ -52,16 +54,28 @@ class ActuatorConfig:
         if not 1.0 / self.rate_hz < self.watchdog_s < self.latch_s:
             raise ConfigError(
                 f"watchdog_s {self.watchdog_s:g} must be longer than one period of rate_hz and shorter than latch_s "
-                f"{self.latch_s:g}."
+                f"{self.latch_s:g} (in seconds: is one in another unit?)."
             )
         if not 1.0 / self.telemetry_rate_hz < self.telemetry_stale_s < self.telemetry_lost_s:
             raise ConfigError(
-                "telemetry_stale_s must be longer than a telemetry period and shorter than telemetry_lost_s."
+                f"telemetry_stale_s {self.telemetry_stale_s:g} must be longer than a telemetry period and shorter than "
+                f"telemetry_lost_s {self.telemetry_lost_s:g} (in seconds: is one in another unit?)."
             )
         if not 0 <= self.controller_id <= 254 or not 0 <= self.host_id <= 254 or self.controller_id == self.host_id:
             raise ConfigError("controller_id and host_id must be two different numbers in 0 ... 254.")
-        if self.open_timeout_s <= 0.0 or self.baud <= 0 or self.bitrate <= 0:
-            raise ConfigError("open_timeout_s, baud and bitrate must be positive.")
+        if not 0.0 < self.open_timeout_s < math.inf or self.baud <= 0 or self.bitrate <= 0:
+            raise ConfigError("open_timeout_s, baud and bitrate must be positive and finite.")
+        for name in ("latch_s", "telemetry_lost_s"):
+            if not math.isfinite(getattr(self, name)):
+                raise ConfigError(f"{name} in [hardware.actuator] is {getattr(self, name)}; give a finite number.")
+
+    def check_deadlines(self) -> None:
+        """Raise ConfigError for a deadline that is too long for the car of a car file.
+
+        Construction allows longer ones, for a program that drives emulated hardware on a busy computer.
+        """
+        for name in ("watchdog_s", "latch_s", "telemetry_stale_s", "telemetry_lost_s"):
+            check_bound(name, "[hardware.actuator]", getattr(self, name), SAFETY_BOUNDS.deadline)
 
     @property
     def device_kind(self) -> DeviceKind:
@@ -78,10 +92,22 @@ class ActuatorConfig:
 
 @dataclass(frozen=True, slots=True)
 class HardwareConfig:
-    """The drivers' part of ``[hardware]``, with the conditions for arming."""
+    """The drivers' part of ``[hardware]``, with the conditions for arming.
+
+    Arming needs a speed of at most ``arm_max_speed_mps``, a motor speed of at most ``arm_max_erpm`` and a pose that is
+    at most ``arm_max_pose_age_s`` old. Raises ConfigError for a condition that is not finite, negative or too large.
+    """
 
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
     calibration: ActuatorCalibration = field(default_factory=ActuatorCalibration)
     arm_max_speed_mps: float = 0.1
     arm_max_pose_age_s: float = 0.1
     arm_max_erpm: float = 200.0
+
+    def __post_init__(self) -> None:
+        for name, bound in (
+            ("arm_max_speed_mps", SAFETY_BOUNDS.rest_speed),
+            ("arm_max_pose_age_s", SAFETY_BOUNDS.deadline),
+            ("arm_max_erpm", SAFETY_BOUNDS.rest_motor_speed),
+        ):
+            check_bound(name, "[hardware]", getattr(self, name), bound)

@@ -129,6 +129,7 @@ def _real_car(tables: Any, path: Path) -> RealCar:
         calibration=from_table(ActuatorCalibration, table("calibration"), f"[hardware.calibration] of {path}"),
         **{name: number(tables[name], f"'{name}' in {where}") for name in _ARMING if name in tables},
     )
+    hardware.actuator.check_deadlines()
     corners_m = as_polygon(arena["corners_m"], f"corners_m in [hardware.arena] of {path}")
     farthest_m = max(abs(coordinate) for corner in corners_m for coordinate in corner)
     if farthest_m > MAX_ARENA_M:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, fields, replace
 from typing import NoReturn
 
@@ -21,12 +21,27 @@ from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, Carlab
 from carlab.core.geofence import can_stop_inside
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import NEUTRAL, Action, CarState, Observation
+from carlab.core.safety_bounds import SAFETY_BOUNDS, Bound, check_bound
 
 FROZEN_POSITION_M, FROZEN_YAW_RAD = 2e-5, 1e-4
 """Smallest change of a live pose: below the noise of motion capture, above the resolution of 32-bit numbers. The pose
 of a car that is blocked with turning wheels still changes by the noise, so it does not count as frozen."""
 CLOCK_TOLERANCE_S = 0.01
 """Largest time of arrival ahead of the car's clock [s]; a later one belongs to another clock."""
+UPPER_BOUNDS: Mapping[str, Bound] = {
+    "max_speed_mps": SAFETY_BOUNDS.speed,
+    "max_yaw_rate_radps": SAFETY_BOUNDS.yaw_rate,
+    "steering_rate_per_s": SAFETY_BOUNDS.command_rate,
+    "throttle_rate_per_s": SAFETY_BOUNDS.command_rate,
+    "jump_margin_m": SAFETY_BOUNDS.jump_distance,
+    "jump_margin_rad": SAFETY_BOUNDS.jump_angle,
+    "stale_pose_s": SAFETY_BOUNDS.deadline,
+    "lost_pose_s": SAFETY_BOUNDS.deadline,
+    "frozen_pose_s": SAFETY_BOUNDS.deadline,
+    "reaction_s": SAFETY_BOUNDS.deadline,
+    "deceleration_mps2": SAFETY_BOUNDS.deceleration,
+}
+"""Upper bound of each limit of an envelope that has a unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +53,7 @@ class SafetyEnvelope:
     ends the episode.
 
     Raises:
-        ConfigError: a limit is out of range.
+        ConfigError: a limit is not a finite number or out of range (``carlab.core.safety_bounds``).
     """
 
     max_steering: float = 1.0
@@ -57,11 +72,11 @@ class SafetyEnvelope:
     arena_m: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
+        for name, bound in UPPER_BOUNDS.items():
+            check_bound(name, "[hardware.limits]", getattr(self, name), bound)
         for name in (f.name for f in fields(self) if f.name not in ("reaction_s", "arena_m")):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be above zero, not {getattr(self, name)}.")
-        if not self.reaction_s >= 0:
-            raise ConfigError(f"reaction_s must not be below zero, but is {self.reaction_s}.")
         if not (0 < self.max_steering <= 1 and 0 < self.max_throttle <= 1):
             raise ConfigError("max_steering and max_throttle must lie in (0, 1].")
         if self.lost_pose_s < self.stale_pose_s:

@@ -33,7 +33,7 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """Build dataclass ``cls`` from a TOML table. Nested dataclasses take nested tables; lists become tuples.
 
     ``where`` names the table in messages, for example ``[mocap] of car.toml``. Raises ConfigError for an unknown
-    key, a missing one, a value of the wrong type or a number that is not finite.
+    key, a missing one, a value of the wrong type or NaN.
     """
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where} must be a table, not {table!r}.")
@@ -50,7 +50,10 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
 
 def number(value: Any, where: str) -> float:
-    """Return ``value`` as a float. Raises ConfigError if it is no number or too large for a float."""
+    """Return ``value`` as a float, which may be NaN or infinite.
+
+    Raises ConfigError if it is no number or too large for a float.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ConfigError(f"{where} must be a number, not {value!r}.")
     try:

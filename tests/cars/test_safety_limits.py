@@ -1,0 +1,72 @@
+"""Safety limits of a car file that are infinite, not a number or in another unit are refused: they disable a guard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import load_car_file
+from carlab.core.errors import ConfigError
+
+ARENA = "[hardware.arena]\ncorners_m = [[-1, -1], [1, -1], [1, 1], [-1, 1]]\n"
+
+
+def car_file(folder: Path, table: str, *lines: str) -> Path:
+    path = folder / "car.toml"
+    path.write_text("\n".join([f"[{table}]", *lines, ARENA]), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("table", "lines", "message"),
+    [
+        ("hardware.limits", ["stale_pose_s = 2.1", "lost_pose_s = 2.1"], "stale_pose_s .* at most 2 s .is it in"),
+        ("hardware.limits", ["lost_pose_s = 500"], "lost_pose_s .* is 500 s; it must be at most 2 s"),
+        ("hardware.limits", ["frozen_pose_s = 400"], "frozen_pose_s .* at most 2 s"),
+        ("hardware.limits", ["reaction_s = 150"], "reaction_s .* at most 2 s"),
+        ("hardware.limits", ["reaction_s = -0.1"], "reaction_s .* below zero"),
+        ("hardware.limits", ["deceleration_mps2 = inf"], "deceleration_mps2 .* is inf; give a finite number"),
+        ("hardware.limits", ["deceleration_mps2 = 3000"], "deceleration_mps2 .* at most 20 m/s2"),
+        ("hardware.limits", ["max_speed_mps = inf"], "max_speed_mps .* finite"),
+        ("hardware.limits", ["max_speed_mps = 5000"], "max_speed_mps .* at most 30 m/s"),
+        ("hardware.limits", ["max_yaw_rate_radps = 1146"], "max_yaw_rate_radps .* at most 100 rad/s"),
+        ("hardware.limits", ["jump_margin_m = 100"], "jump_margin_m .* at most 2 m"),
+        ("hardware.limits", ["jump_margin_rad = 28.6"], "jump_margin_rad .* at most 3.14159 rad"),
+        ("hardware.limits", ["throttle_rate_per_s = inf"], "throttle_rate_per_s .* finite"),
+        ("hardware.actuator", ["watchdog_s = 150"], "watchdog_s 150 must .* is one in another unit"),
+        ("hardware.actuator", ["watchdog_s = 150", "latch_s = 500"], "watchdog_s .* is 150 s; it must be at most 2 s"),
+        ("hardware.actuator", ["latch_s = 500"], "latch_s .* at most 2 s .is it in another unit"),
+        ("hardware.actuator", ["latch_s = inf"], "latch_s .* is inf"),
+        ("hardware.actuator", ["telemetry_stale_s = 250"], "telemetry_stale_s 250 must .* is one in another unit"),
+        ("hardware.actuator", ["telemetry_stale_s = 250", "telemetry_lost_s = 1000"], "telemetry_stale_s .* most 2 s"),
+        ("hardware.actuator", ["telemetry_lost_s = inf"], "telemetry_lost_s .* is inf"),
+        ("hardware.actuator", ["open_timeout_s = inf"], "open_timeout_s"),
+        ("hardware", ["arm_max_erpm = nan"], "arm_max_erpm .* nan; give a finite number"),
+        ("hardware", ["arm_max_erpm = inf"], "arm_max_erpm .* finite"),
+        ("hardware", ["arm_max_erpm = -1"], "arm_max_erpm .* below zero"),
+        ("hardware", ["arm_max_pose_age_s = inf"], "arm_max_pose_age_s .* finite"),
+        ("hardware", ["arm_max_pose_age_s = nan"], "arm_max_pose_age_s .* nan; give a finite number"),
+        ("hardware", ["arm_max_pose_age_s = 100"], "arm_max_pose_age_s .* at most 2 s"),
+        ("hardware", ["arm_max_speed_mps = 100"], "arm_max_speed_mps .* at most 1 m/s"),
+    ],
+)  # fmt: skip
+def test_limit_that_disables_a_guard_is_refused(tmp_path: Path, table: str, lines: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_car_file(car_file(tmp_path, table, *lines))
+    assert "\n" not in str(caught.value)
+
+
+def test_limits_up_to_their_bounds_are_accepted(tmp_path: Path) -> None:
+    limits = ["stale_pose_s = 2", "lost_pose_s = 2", "frozen_pose_s = 2", "reaction_s = 0", "deceleration_mps2 = 20"]
+    real = load_car_file(car_file(tmp_path, "hardware.limits", *limits, "max_speed_mps = 30")).real
+    assert real is not None
+    assert (real.envelope.stale_pose_s, real.envelope.reaction_s, real.envelope.max_speed_mps) == (2.0, 0.0, 30.0)
+    actuator = ["watchdog_s = 1.9", "latch_s = 2", "telemetry_stale_s = 1.9", "telemetry_lost_s = 2"]
+    real = load_car_file(car_file(tmp_path, "hardware.actuator", *actuator)).real
+    assert real is not None
+    assert real.hardware.actuator.latch_s == 2.0
+    arming = ["arm_max_speed_mps = 0", "arm_max_erpm = 0", "arm_max_pose_age_s = 2"]
+    real = load_car_file(car_file(tmp_path, "hardware", *arming)).real
+    assert real is not None
+    assert (real.hardware.arm_max_speed_mps, real.hardware.arm_max_pose_age_s) == (0.0, 2.0)
