@@ -10,6 +10,7 @@ from typing import Final
 import can
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
+from drivers.links.bus_lock import BusLock
 from drivers.links.link import CanFrame, LinkStatistics
 
 BUS_OFF: Final = 0x40
@@ -45,23 +46,29 @@ class CanLink:
 
     A frame that the controller cannot send now must not be sent later. Each send has a time-out of zero; after an
     error the device closes the link, which drops the frames in the adapter's queue, and opens it again.
+
+    With a ``controller_id``, the open link holds the lock on this controller (``drivers.links.bus_lock``).
     """
 
-    def __init__(self, interface: str, channel: str, bitrate: int = 500_000) -> None:
+    def __init__(self, interface: str, channel: str, bitrate: int = 500_000, controller_id: int | None = None) -> None:
         self.interface = interface
         self.channel = channel
         self.bitrate = bitrate
         self.statistics = LinkStatistics()
         self._bus: can.BusABC | None = None
         self._descriptor: int | None = None
+        self._lock = None if controller_id is None else BusLock(interface, channel, controller_id)
 
     def open(self) -> None:
-        """Open the bus. Raises NotReadyError with the remedy."""
+        """Lock the controller and open the bus. Raises NotReadyError with the remedy."""
         if self._bus is not None:
             return
+        if self._lock is not None:
+            self._lock.acquire()
         try:
             self._bus = self._open_bus()
-        except (can.CanError, OSError, ValueError, ImportError) as error:
+        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
+            self._unlock()
             raise NotReadyError(
                 f"CAN bus {self.interface} {self.channel} cannot be opened", (self._reason(error),)
             ) from error
@@ -111,10 +118,17 @@ class CanLink:
         return self._descriptor
 
     def close(self) -> None:
-        """Shut the bus down and drop unsent frames."""
+        """Shut the bus down, drop unsent frames, and release the controller."""
         bus, self._bus, self._descriptor = self._bus, None, None
-        if bus is not None:
-            bus.shutdown()
+        try:
+            if bus is not None:
+                bus.shutdown()
+        finally:
+            self._unlock()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
 
     def _open_bus(self) -> can.BusABC:
         return open_bus(self.interface, self.channel, self.bitrate)

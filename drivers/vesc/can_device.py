@@ -82,6 +82,5 @@ class VescCanDevice:
 
 def make_device(config: ActuatorConfig) -> VescCanDevice:
     """Create the VESC of a configuration without opening its bus."""
-    return VescCanDevice(
-        CanLink(config.interface, config.channel, config.bitrate), config.controller_id, config.host_id
-    )
+    link = CanLink(config.interface, config.channel, config.bitrate, config.controller_id)
+    return VescCanDevice(link, config.controller_id, config.host_id)

@@ -1,0 +1,170 @@
+"""Two programs cannot command one motor controller of a CAN bus."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from pathlib import Path
+
+import pytest
+
+from carlab.core.errors import NotReadyError
+from carlab.core.quantities import Action
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.emulators.can_firmware import CanFirmware
+from drivers.emulators.command_log import CommandLog
+from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.links.bus_lock import BusLock
+from drivers.links.can_link import CanLink
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMEOUT_S = 20.0
+HOLDER = """
+import sys, time
+from drivers.links.bus_lock import BusLock
+lock = BusLock("socketcan", "can0", 23)
+lock.acquire()
+print("locked", flush=True)
+time.sleep(60.0)
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder for temporary files, which child processes use too."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    return tmp_path
+
+
+def multicast_config() -> ActuatorConfig:
+    channel = f"239.74.163.2:{20000 + uuid.uuid4().int % 20000}"
+    return ActuatorConfig(
+        kind="vesc_can", interface="udp_multicast", channel=channel, watchdog_s=2.0, latch_s=30.0,
+        telemetry_stale_s=5.0, telemetry_lost_s=10.0, open_timeout_s=TIMEOUT_S,
+    )  # fmt: skip
+
+
+def test_second_sender_is_refused_and_sends_nothing_to_the_controller() -> None:
+    config = multicast_config()
+    log = CommandLog()
+    with CanFirmware(VescFirmware(log), "udp_multicast", config.channel):
+        with Actuator(config, ActuatorCalibration(max_current_a=10.0)) as first:
+            first.arm()
+            first.command(Action(0.5, 0.3))
+            end_s = time.monotonic() + TIMEOUT_S
+            while not any(entry.value == 3.0 for entry in log.motor()):
+                assert time.monotonic() < end_s
+                time.sleep(0.01)
+            t_s = time.monotonic()
+            sender_pid = first._sender.pid  # type: ignore[union-attr]
+            with pytest.raises(NotReadyError, match=rf"is in use: .*process {sender_pid}, .* end that program first"):
+                Actuator(config, ActuatorCalibration()).open()
+            first.command(Action(0.5, 0.3))
+            time.sleep(0.1)
+            values = [entry.value for entry in log.motor(t_s)]
+            assert values
+            assert set(values) == {3.0}, "neutral commands of the second sender would be between them"
+        with Actuator(config, ActuatorCalibration()) as next_one:
+            next_one.arm()
+
+
+def test_killed_holder_releases_the_lock() -> None:
+    lock, other = BusLock("socketcan", "can0", 23), BusLock("socketcan", "can0", 24)
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "locked\n"
+        with pytest.raises(NotReadyError, match=f"process {holder.pid}, started by process {os.getpid()}"):
+            lock.acquire()
+        other.acquire()
+        other.release()
+        holder.send_signal(signal.SIGKILL)
+        holder.communicate(timeout=TIMEOUT_S)
+        lock.acquire()
+        with pytest.raises(NotReadyError, match=f"process {os.getpid()}"):
+            BusLock("socketcan", "can0", 23).acquire()
+    finally:
+        holder.kill()
+        holder.communicate()
+        lock.release()
+
+
+def test_two_links_exclude_each_other_until_one_is_closed() -> None:
+    channel = f"test-{uuid.uuid4()}"
+    first, second = CanLink("virtual", channel, controller_id=23), CanLink("virtual", channel, controller_id=23)
+    first.open()
+    first.open()
+    with pytest.raises(NotReadyError, match=r"Controller 23 on CAN bus virtual .* is in use"):
+        second.open()
+    other = CanLink("virtual", channel, controller_id=24)
+    other.open()
+    other.close()
+    first.close()
+    second.open()
+    second.close()
+    second.close()
+
+
+def test_failed_opening_releases_the_controller(own_folder: Path) -> None:
+    link = CanLink("no_such_interface", "x", controller_id=23)
+    for _ in range(2):
+        with pytest.raises(NotReadyError, match="cannot be opened"):
+            link.open()
+    assert list(own_folder.iterdir()) == []
+
+
+def test_lock_file_serves_every_user_and_is_removed(own_folder: Path) -> None:
+    lock = BusLock("socketcan", "can0", 23)
+    lock.acquire()
+    (path,) = own_folder.iterdir()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666
+    lock.release()
+    lock.release()
+    assert list(own_folder.iterdir()) == []
+
+
+def test_file_that_cannot_be_locked_is_refused_with_the_remedy(own_folder: Path) -> None:
+    lock = BusLock("socketcan", "can0", 23)
+    lock.path.symlink_to(own_folder / "target")
+    with pytest.raises(NotReadyError, match="set TMPDIR to a folder"):
+        lock.acquire()
+    assert not (own_folder / "target").exists()
+    lock.path.unlink()
+    own_folder.rmdir()
+    with pytest.raises(NotReadyError, match="the folder does not exist"):
+        lock.acquire()
+
+
+def test_one_of_many_threads_holds_the_lock_at_any_time() -> None:
+    """Holders remove the file while others open it."""
+    holders: list[int] = []
+    counts: list[int] = []
+
+    def work() -> None:
+        for _ in range(300):
+            lock = BusLock("socketcan", "can0", 23)
+            try:
+                lock.acquire()
+            except NotReadyError:
+                continue
+            holders.append(1)
+            counts.append(len(holders))
+            holders.pop()
+            lock.release()
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(counts) > 10
+    assert set(counts) == {1}
