@@ -166,6 +166,11 @@ class HardwareCar(Car):
         readings = {**actuator.readings, **{f"mocap_{k}": v for k, v in self.pose_source.statistics().items()}}
         return Health(not problems, problems, readings)
 
+    @property
+    def watchdog_trips(self) -> int:
+        """Trips of the sender's watchdog since ``open``; 0 when closed."""
+        return self.actuator.status().watchdog_trips if self._is_open else 0
+
     def place(self, state: CarState) -> bool:
         """Move an emulated car to ``state`` and wait for a pose captured afterwards (a second at most).
 

@@ -85,6 +85,7 @@ class SimulatedCar(Car):
         self._open = self._armed = False
         self._fault: str | None = None
         self._fresh_until_s: float | None = None
+        self._watchdog_trips = 0
         self._new_poses: list[PoseSample] = []
 
     def open(self) -> None:
@@ -92,6 +93,7 @@ class SimulatedCar(Car):
         if self._open:
             return
         self._open, self._armed, self._fault = True, False, None
+        self._watchdog_trips = 0
         self.place(self._start)
 
     def place(self, state: CarState) -> bool:
@@ -112,6 +114,11 @@ class SimulatedCar(Car):
         self._plant.reset(state, arrive_s)
         self.clock.sleep_until(arrive_s)
         return True
+
+    @property
+    def watchdog_trips(self) -> int:
+        """Number of times since ``open`` that the watchdog has set neutral."""
+        return self._watchdog_trips
 
     @property
     def true_state(self) -> CarState:
@@ -211,6 +218,7 @@ class SimulatedCar(Car):
         if self._fresh_until_s is not None and now_s >= self._fresh_until_s:
             self._plant.command(self._fresh_until_s + self._extra_command_latency_s, NEUTRAL)
             self._fresh_until_s = None
+            self._watchdog_trips += 1
 
     def _run_to(self, now_s: float) -> None:
         self._run_watchdog(now_s)

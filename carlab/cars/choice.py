@@ -13,6 +13,7 @@ from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, ActionLimits, Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.track import Track
+from drivers.config import ActuatorConfig
 from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 PLUGIN_GROUP = "carlab.cars"
@@ -24,7 +25,7 @@ class CarChoice:
 
     ``log_to`` sets the folder for the firmware log of an emulated car; other cars ignore it. ``as_sent`` maps an
     action to the action that the car would send (rounded by the calibration), for a dry run. ``track`` is that of the
-    car file.
+    car file. ``watchdog_s`` is the age of a command at which the car replaces it by neutral [s]; None if unknown.
     """
 
     car: Car
@@ -34,6 +35,7 @@ class CarChoice:
     log_to: Callable[[Path], None] = field(default=lambda folder: None)
     as_sent: Callable[[Action], Action] | None = None
     track: Track | None = None
+    watchdog_s: float | None = None
 
     @property
     def control_period_s(self) -> float:
@@ -64,9 +66,10 @@ def choose_car(
         log_folder: where an emulated car writes its log.
 
     Raises:
-        ConfigError: unknown car, or an error in its file.
+        ConfigError: unknown car, an error in its file, or a control period that its watchdog does not permit.
     """
     choice = _choose(name, vehicle, reality, seed)
+    _check_watchdog(choice)
     if log_folder is not None:
         choice.log_to(log_folder)
     if dry_run:
@@ -105,6 +108,17 @@ def _choose(
     return _real(file, seed)
 
 
+def _check_watchdog(choice: CarChoice) -> None:
+    """Raise ConfigError if the watchdog sets neutral within each tick: recordings would contain commands not held."""
+    period_s, watchdog_s = choice.control_period_s, choice.watchdog_s
+    if watchdog_s is not None and not period_s < watchdog_s:
+        raise ConfigError(
+            f"control_period in [timing] is {period_s:g} s, but the watchdog sets neutral {watchdog_s:g} s after a "
+            f"command, within each tick; set a control_period below {watchdog_s:g} s, or a longer watchdog_s (and "
+            "latch_s) in [hardware.actuator]."
+        )
+
+
 def _read(car: Path | CarFile) -> CarFile:
     return car if isinstance(car, CarFile) else load_car_file(car)
 
@@ -122,16 +136,27 @@ def _config_toml(file: CarFile, car: str) -> str:
 def _simulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
     from sim_backends.simulated_car import SimulatedCar
 
-    car = SimulatedCar(truth or file.simulator, seed=seed, name=file.name)
-    return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, "sim"), track=file.track)
+    watchdog_s = _actuator(file).watchdog_s
+    car = SimulatedCar(truth or file.simulator, seed=seed, name=file.name, watchdog_s=watchdog_s)
+    text = _config_toml(file, "sim")
+    return CarChoice(car, file.simulator, _envelope(file), text, track=file.track, watchdog_s=watchdog_s)
 
 
 def _emulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None, actuator: str = "serial") -> CarChoice:
     from carlab.cars.emulated_car import EmulatedCar
 
-    car = EmulatedCar(file, actuator=actuator, seed=seed, reality=truth)
-    name = "emulated" if actuator == "serial" else "emulated-can"
-    return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, name), car.log_to, track=file.track)
+    config = _actuator(file)
+    deadlines = {"rate_hz": config.rate_hz, "watchdog_s": config.watchdog_s, "latch_s": config.latch_s}
+    car = EmulatedCar(file, actuator=actuator, seed=seed, reality=truth, actuator_options=deadlines)
+    return CarChoice(
+        car,
+        file.simulator,
+        _envelope(file),
+        _config_toml(file, "emulated" if actuator == "serial" else "emulated-can"),
+        car.log_to,
+        track=file.track,
+        watchdog_s=config.watchdog_s,
+    )
 
 
 def _emulated_can(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
@@ -163,7 +188,13 @@ def _real(file: CarFile, seed: int) -> CarChoice:
         _config_toml(file, real.name),
         as_sent=lambda action: calibration.from_device(calibration.to_device(action)),
         track=file.track,
+        watchdog_s=real.hardware.actuator.watchdog_s,
     )
+
+
+def _actuator(file: CarFile) -> ActuatorConfig:
+    """The actuator of the real car, whose deadlines its simulation and emulation share; the default one without it."""
+    return ActuatorConfig() if file.real is None else file.real.hardware.actuator
 
 
 def _envelope(file: CarFile) -> SafetyEnvelope:

@@ -233,6 +233,11 @@ class EmulatedCar(Car):
         """Health of the driver."""
         return Health(False, (f"{self.name} is not open.",)) if self._car is None else self._car.health()
 
+    @property
+    def watchdog_trips(self) -> int:
+        """Trips of the driver's watchdog since ``open``; 0 when closed."""
+        return 0 if self._car is None else self._car.watchdog_trips
+
     def place(self, state: CarState) -> bool:
         """Put the car at ``state`` and wait until no pose of the old place is in a velocity window."""
         placed = self.hardware.place(state)

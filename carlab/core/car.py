@@ -58,6 +58,11 @@ class Car(ABC):
     def close(self) -> None:
         """Send neutral, then disconnect. Idempotent and safe after any failure."""
 
+    @property
+    def watchdog_trips(self) -> int:
+        """Number of times since ``open`` that a command became too old and neutral replaced it; 0 if unknown."""
+        return 0
+
     def place(self, state: CarState) -> bool:
         """Put the car at ``state`` without driving; returns False if a person has to do it."""
         return False

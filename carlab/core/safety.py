@@ -233,12 +233,14 @@ class SafeCar:
         self._seen: Observation | None = None
         self._frozen = FrozenPoseDetector(envelope.frozen_pose_s)
         self._active: frozenset[str] = frozenset()
+        self._watchdog_trips = 0
 
     def arm(self) -> None:
         """Arm the car. Raises the errors of Car.arm."""
         self.car.arm()
         self.state = SafetyState.ARMED
         self._sent, self._sent_s, self._seen = NEUTRAL, None, None
+        self._watchdog_trips = self.car.watchdog_trips
         self._frozen.reset()
 
     def command(self, requested: Action, observation: Observation, period_s: float) -> Action:
@@ -251,6 +253,7 @@ class SafeCar:
         now_s = self.car.clock.now_s()
         if self.state not in (SafetyState.ARMED, SafetyState.PAUSED):
             raise NotArmedError("The safety gate is not armed; call arm() first.")
+        self._report_watchdog(now_s)
         if not requested.is_finite:
             self._end(EndReason.BAD_COMMAND, f"The requested command is {requested}.", now_s)
         found = violation(observation, self._seen, now_s, self.envelope)
@@ -290,6 +293,14 @@ class SafeCar:
         """Send neutral and disarm; ``planned=False`` latches a fault."""
         self.state = SafetyState.DISARMED if planned else SafetyState.FAULT
         self.car.stop(planned=planned)
+
+    def _report_watchdog(self, now_s: float) -> None:
+        """Emit an event if the car's watchdog has replaced a command since the last tick: it was not held."""
+        trips = self.car.watchdog_trips
+        if trips > self._watchdog_trips:
+            text = "The last command became too old before the next one: the watchdog set neutral in between."
+            self._on_event(SafetyEvent(now_s, "watchdog", text))
+        self._watchdog_trips = trips
 
     def _end(self, reason: EndReason, detail: str, now_s: float) -> NoReturn:
         self.stop(planned=False)

@@ -254,6 +254,18 @@ def test_events_are_emitted_at_the_start_of_an_intervention_only() -> None:
     assert [a.throttle for a in car.log] == [0.1, 0.2, 0.2, 0.1, 0.2]
 
 
+def test_watchdog_trips_are_reported_once_and_from_arming_on() -> None:
+    safe, car, events = gate()
+    car.trips = 3
+    safe.arm()
+    for trips in (3, 4, 4, 6):
+        car.trips = trips
+        safe.command(Action(0.0, 0.1), seen(car.clock.now_s()), PERIOD_S)
+        car.clock.sleep_until(car.clock.now_s() + PERIOD_S)
+    assert [(e.kind, round((e.t_s - 10.0) / PERIOD_S)) for e in events] == [("watchdog", 1), ("watchdog", 3)]
+    assert [a.throttle for a in car.log] == [0.1] * 4
+
+
 def test_narrower_limit_of_envelope_and_car_applies() -> None:
     for steering, throttle in ((0.3, 0.9), (0.9, 0.3)):
         car = LoggingCar()

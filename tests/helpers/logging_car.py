@@ -15,6 +15,7 @@ class LoggingCar(Car):
         self.limits, self.clock = ActionLimits(), SimulatedClock(10.0)
         self.log: list[Action] = []
         self.stops: list[bool] = []
+        self.trips = 0
 
     def open(self) -> None: ...
     def observe(self) -> Observation:
@@ -32,6 +33,10 @@ class LoggingCar(Car):
     def reset_fault(self) -> None: ...
     def health(self) -> Health:
         return Health(True)
+
+    @property
+    def watchdog_trips(self) -> int:
+        return self.trips
 
     def close(self) -> None: ...
 
