@@ -9,6 +9,7 @@ from typing import Literal
 
 from rich.text import Text
 
+from carlab.api.arguments import at_least
 from carlab.cli.console import console
 from carlab.core.errors import ConfigError, NotReadyError
 
@@ -96,6 +97,7 @@ class Emulate:
         return 0
 
     def _check_options(self) -> None:
+        at_least(0, seed=self.seed)
         for name, port in (("command-port", self.command_port), ("data-port", self.data_port)):
             if not 0 <= port <= 65535:
                 raise ConfigError(f"--{name} {port}: give a number from 0 to 65535.")

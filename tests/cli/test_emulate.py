@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 from carlab.cars import load_car_file
 from drivers.calibration import ActuatorCalibration
 
+Carlab = Callable[..., tuple[int, str]]
 ARENA = "[hardware.arena]\ncorners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]\n"
 
 
@@ -34,3 +36,9 @@ def test_printed_tables_are_a_car_file_with_the_emulated_calibration(tmp_path: P
     assert file.real is not None
     assert file.real.hardware.calibration == ActuatorCalibration()
     assert file.real.hardware.actuator.port == str(tmp_path / "vesc")
+
+
+def test_negative_seed_is_refused(carlab: Carlab, tmp_path: Path) -> None:
+    code, text = carlab("emulate", "--port", tmp_path / "vesc", "--seed", -1)
+    assert code == 2
+    assert "--seed -1: give at least 0." in text
