@@ -192,16 +192,18 @@ class Replay:
 
 
 def _print_difference(driven: EpisodeData, episode: EpisodeData) -> None:
-    """Print the difference between the drive and the recording."""
+    """Print the difference between the drive and the recording at times that the drive reached, and at its end."""
     elapsed_s = driven.times_s - driven.times_s[0]
     recorded = np.stack([np.interp(elapsed_s, episode.times_s - episode.times_s[0], c) for c in _unwrapped(episode).T])
     error = np.abs(_unwrapped(driven) - recorded.T)
-    shown = [int(np.argmin(np.abs(elapsed_s - t_s))) for t_s in (0.5, 1.0, 2.0)]
+    times_s = [t_s for t_s in (0.5, 1.0, 2.0) if t_s <= elapsed_s[-1] + 1e-6]
+    indices = [int(np.argmin(np.abs(elapsed_s - t_s))) for t_s in times_s]
     rows = [
-        [f"{name} [{unit}]", *(f"{error[row, k]:.4f}" for row in (*shown, -1))]
+        [f"{name} [{unit}]", *(f"{error[index, k]:.4f}" for index in (*indices, -1))]
         for k, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))
     ]
-    table("Difference to the recording", ["channel", "0.5 s", "1 s", "2 s", f"end ({elapsed_s[-1]:.1f} s)"], rows)
+    columns = ["channel", *(f"{t_s:g} s" for t_s in times_s), f"end ({elapsed_s[-1]:.2f} s)"]
+    table("Difference to the recording", columns, rows)
 
 
 def _unwrapped(episode: EpisodeData) -> FloatArray:

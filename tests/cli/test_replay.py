@@ -84,3 +84,16 @@ def test_adaptation_and_driving_exclude_each_other(carlab: Carlab, tmp_path: Pat
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0), "--adapt", "--drive")
     assert code == 2
     assert "--adapt is for predictions by a simulated car; remove it to drive." in text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "columns"),
+    [("0.01", "channel end (0.03 s)"), ("0.7", "channel 0.5 s end (0.70 s)"), ("1", "channel 0.5 s 1 s end (1.00 s)")],
+)
+def test_difference_is_printed_only_at_times_that_the_drive_reached(
+    carlab: Carlab, tmp_path: Path, seconds: str, columns: str
+) -> None:
+    path = circle(tmp_path / "drive.csv", 5.0)
+    code, text = carlab("replay", path, "--drive", "--seconds", seconds, "--out", tmp_path / "runs")
+    assert code == 0
+    assert columns in " ".join(re.sub(r"[^\w.() \[\]/]", " ", text).split())
