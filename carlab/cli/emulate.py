@@ -11,6 +11,7 @@ from rich.text import Text
 
 from carlab.api.arguments import at_least
 from carlab.cli.console import console
+from carlab.cli.options import log_file
 from carlab.core.errors import ConfigError, NotReadyError
 
 
@@ -50,7 +51,7 @@ class Emulate:
     """Seed of the sensor noise."""
 
     log: Path | None = None
-    """Write each command that the firmware receives as a JSON line."""
+    """Append each command that the firmware receives to this file as a JSON line; its folder must exist."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -98,6 +99,8 @@ class Emulate:
 
     def _check_options(self) -> None:
         at_least(0, seed=self.seed)
+        if self.log is not None:
+            log_file(self.log, "--log")
         for name, port in (("command-port", self.command_port), ("data-port", self.data_port)):
             if not 0 <= port <= 65535:
                 raise ConfigError(f"--{name} {port}: give a number from 0 to 65535.")

@@ -109,3 +109,21 @@ def json_file(path: Path, option: str) -> Path:
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first.")
     return path
+
+
+def log_file(path: Path, option: str) -> Path:
+    """Return a path to which lines will be appended; the file may exist already.
+
+    Raises:
+        ConfigError: the path is a folder, or its folder is missing.
+        DataError: the file or its folder is not writable.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: it is a folder; name a file in it, such as {path / 'commands.jsonl'}.")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first.")
+    if not path.exists():
+        _check_folder(path.parent, f"{option} {path}")
+    elif not os.access(path, os.W_OK):
+        raise DataError(f"{option} {path}: it is not writable; choose another file or change its permissions.")
+    return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import logging
 import threading
@@ -89,9 +90,10 @@ class CommandLog:
 
     def _give_up_file(self, error: OSError) -> None:
         logger.warning(
-            "The log of the emulated firmware cannot be written to %s (%s); free some disk space.",
+            "The log of the emulated firmware cannot be written to %s (%s); %s.",
             self.path,
             error.strerror or error,
+            _remedy(error),
         )
         if self._file is not None:
             with contextlib.suppress(OSError):
@@ -100,6 +102,15 @@ class CommandLog:
 
     def _first(self, name: str, since_s: float) -> LogEntry | None:
         return next((e for e in self._entries if e.name == name and e.t_s >= since_s), None)
+
+
+def _remedy(error: OSError) -> str:
+    """What a person can do about a log file that cannot be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "free some disk space"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return "check its permissions or choose another file"
+    return "choose another file"
 
 
 def read_log(path: Path) -> list[LogEntry]:

@@ -42,3 +42,13 @@ def test_negative_seed_is_refused(carlab: Carlab, tmp_path: Path) -> None:
     code, text = carlab("emulate", "--port", tmp_path / "vesc", "--seed", -1)
     assert code == 2
     assert "--seed -1: give at least 0." in text
+
+
+def test_log_that_cannot_be_written_is_refused(carlab: Carlab, tmp_path: Path) -> None:
+    emulate = ("emulate", "--port", tmp_path / "vesc", "--log")
+    code, text = carlab(*emulate, tmp_path / "missing" / "log.jsonl")
+    assert code == 2
+    assert f"there is no folder {tmp_path / 'missing'}; create it first." in text
+    code, text = carlab(*emulate, tmp_path)
+    assert code == 2
+    assert f"--log {tmp_path}: it is a folder; name a file in it" in text

@@ -20,7 +20,14 @@ def test_full_disk_is_reported_once_and_entries_stay_in_memory(caplog: pytest.Lo
     log.close()
     assert [e.t_s for e in log.entries("current")] == [0.0, 1.0, 2.0]
     assert len(caplog.messages) == 1
-    assert "No space left on device" in caplog.messages[0]
+    assert "(No space left on device); free some disk space." in caplog.messages[0]
+
+
+def test_warning_about_a_folder_advises_another_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    log = CommandLog(tmp_path)
+    log.open()
+    log.close()
+    assert "(Is a directory); choose another file." in caplog.messages[0]
 
 
 def test_log_of_a_run_whose_folder_was_removed_stays_in_memory(
