@@ -9,7 +9,8 @@ from carlab.api.cars import load_car
 from carlab.api.checking import CarCheck, check
 from carlab.api.comparison import compare
 from carlab.api.diagnosis import DiagnosisReport, diagnose
-from carlab.api.driving import DriveRun, drive, replay
+from carlab.api.drive_run import DriveRun
+from carlab.api.driving import drive, replay
 from carlab.api.learning import LearnHooks, LearnRun, learn
 from carlab.api.prediction import PredictionErrors, predict
 from carlab.api.recordings import Recording, load, save_run

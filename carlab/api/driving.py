@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import above_zero, at_least
+from carlab.api.drive_run import DriveRun, results_kept
 from carlab.api.runs import (
     RunHooks,
     collecting,
     followed_by,
     has_screen,
-    html_picture,
-    html_table,
     learning_run,
     new_run,
     viewer_connection,
-    write_result,
 )
 from carlab.api.tasks import given_task, load_checked
-from carlab.core.errors import ConfigError, DataError, NotReadyError
+from carlab.core.errors import ConfigError, NotReadyError
 from carlab.core.manoeuvres import MANOEUVRES
 
 if TYPE_CHECKING:
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
     from carlab.core.clock import Clock
     from carlab.core.documents import Tick
     from carlab.core.episode_data import EpisodeData
-    from carlab.core.outcome import EndReason
     from carlab.core.policy import Policy
     from carlab.core.safety import SafetyEnvelope
     from carlab.core.task import Task
@@ -44,48 +41,6 @@ if TYPE_CHECKING:
 
 KEY_THROTTLE = 0.4
 TELEOP_MAX_TICKS = 10**6
-PICTURE_FILE = "summary.png"
-
-
-@dataclass(frozen=True)
-class DriveRun:
-    """Result of ``carlab.drive``.
-
-    Attributes:
-        folder: the run's folder.
-        episodes: each with ``data`` (arrays), ``reason`` (end reason), ``summary`` (figures of the task), ``path``.
-    """
-
-    folder: Path
-    episodes: tuple[EpisodeResult, ...]
-
-    @property
-    def recordings(self) -> list[Path]:
-        """The MCAP files."""
-        return [episode.path for episode in self.episodes]
-
-    @property
-    def picture(self) -> Path:
-        """Path of the summary picture; the file exists only if it was drawn."""
-        return self.folder / PICTURE_FILE
-
-    @property
-    def end(self) -> EndReason | None:
-        """End reason of the last episode; None without episodes."""
-        return self.episodes[-1].reason if self.episodes else None
-
-    def __repr__(self) -> str:
-        """One line: folder, number of episodes, last end."""
-        end = "nothing driven" if self.end is None else self.end.name.lower()
-        return f"<DriveRun {self.folder}: {len(self.episodes)} episodes, {end}>"
-
-    def _repr_html_(self) -> str:
-        names = list(self.episodes[0].summary) if self.episodes else []
-        rows = [
-            [e.episode, e.data.ticks, e.total_reward, *(float(e.summary[n]) for n in names), e.reason.name.lower()]
-            for e in self.episodes
-        ]
-        return html_table(["episode", "ticks", "return", *names, "end"], rows) + html_picture(self.picture)
 
 
 def drive(
@@ -97,6 +52,8 @@ def drive(
     hooks: RunHooks | None = None,
 ) -> DriveRun:  # fmt: skip
     """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
+
+    result.json is written after each episode, so an error or ^C loses no finished episode.
 
     Args:
         car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
@@ -144,9 +101,9 @@ def drive(
 
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
-        with _results_kept_after_an_error(run, picture) as results:
-            _drive(choice, driver, chosen_task, max_throttle, run, episodes, collecting(hooks, results), options)
-    _write_results(run, results, picture)
+        with results_kept(run, picture) as results:
+            hooks = collecting(hooks, run, results)
+            _drive(choice, driver, chosen_task, max_throttle, run, episodes, hooks, options)
     return DriveRun(run.path, tuple(results))
 
 
@@ -229,7 +186,11 @@ def _drive(
     hooks: RunHooks,
     options: dict[str, Any],
 ) -> list[EpisodeResult]:
-    """Open policy and car and drive the episodes; ``options`` go to ``Session``."""
+    """Open policy and car and drive the episodes; ``options`` go to ``Session``.
+
+    From the first episode until the car is closed, a signal such as ^C interrupts nothing but the driving.
+    """
+    from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.experiment.episodes.session import Session
 
     driver, teleop = _policy(policy, max_throttle, choice.simulator)
@@ -238,40 +199,19 @@ def _drive(
         whole = math.ceil(MANOEUVRES[policy]().duration_s / choice.control_period_s) + 1
         options = {**options, "max_ticks": whole}
     session_hooks = hooks.session()
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as signals, contextlib.ExitStack() as stack:
         if teleop is not None:
             session_hooks = _by_hand(session_hooks, teleop, choice.car.clock)
             options = {**options, "max_ticks": options["max_ticks"] or TELEOP_MAX_TICKS}
             stack.enter_context(teleop)
         stack.enter_context(choice.car)
+        signals.enter_context(Interrupts())
         envelope = _envelope(choice.envelope, task, max_throttle)
         session = Session(
             choice.car, driver, task, envelope, run, choice.control_period_s, config_toml=choice.config_toml,
             hooks=session_hooks, **options,
         )  # fmt: skip
         return session.drive(episodes)
-
-
-@contextlib.contextmanager
-def _results_kept_after_an_error(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResult]]:
-    """A list of results; those before a DataError are written, and its message names their place."""
-    results: list[EpisodeResult] = []
-    try:
-        yield results
-    except DataError as error:
-        _write_results(run, results, picture)
-        place = f" {run.path} has the {len(results)} episodes before, see result.json." if results else ""
-        raise DataError(f"{error}{place}") from error
-
-
-def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture: bool) -> None:
-    from carlab.recording import read_episode, save_summary
-
-    if results:
-        write_result(run, results)
-    episodes = [read_episode(r.path) for r in results if r.path.exists()] if picture else []
-    if episodes:
-        save_summary(episodes, run.path / PICTURE_FILE)
 
 
 def _policy_names() -> tuple[str, ...]:

@@ -268,8 +268,7 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
             results.append(result)
             hooks.on_result(result)
             write_report(campaign.run, campaign.plan, progress.rows[-1])
-    if results and campaign.run.path.is_dir():
-        write_result(campaign.run, results)
+            write_result(campaign.run, results)
     return LearnRun(campaign.run.path, campaign.episodes, tuple(progress.rows), tuple(results))
 
 

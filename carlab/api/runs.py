@@ -230,11 +230,12 @@ def followed_by(first: Callable[P, None], second: Callable[P, None]) -> Callable
     return both
 
 
-def collecting(hooks: RunHooks, results: list[EpisodeResult]) -> RunHooks:
-    """The hooks; each finished episode is also appended to ``results``."""
+def collecting(hooks: RunHooks, run: RunDirectory, results: list[EpisodeResult]) -> RunHooks:
+    """The hooks; each finished episode is also appended to ``results`` and to result.json."""
 
     def on_result(result: EpisodeResult) -> None:
         results.append(result)
+        write_result(run, results)
         hooks.on_result(result)
 
     return replace(hooks, on_result=on_result)

@@ -59,8 +59,8 @@ def run(argv: Sequence[str]) -> int:
     except CarlabError as error:
         fail(f"{error}{_where_options_belong(argv[0], error)}")
         return error.exit_code
-    except KeyboardInterrupt:
-        fail("Interrupted.")
+    except KeyboardInterrupt as error:
+        fail(" ".join(("Interrupted.", *getattr(error, "__notes__", ()))))
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -86,3 +86,13 @@ class ActuatorFaultError(CarlabError, OSError):
     """The actuator link, its firmware or the sender process failed. Latched until reset."""
 
     exit_code = 4
+
+
+def add_sentence(error: BaseException, sentence: str) -> None:
+    """Append a sentence to the message of a CarlabError; another error gets it as a note, which its traceback shows."""
+    if isinstance(error, CarlabError):
+        message = str(error)
+        separator = "\n" if "\n" in message else " "
+        error.args = (f"{message}{separator}{sentence}",)
+    else:
+        error.add_note(sentence)

@@ -39,6 +39,15 @@ def test_signal_in_an_inner_context_is_passed_to_the_outer_one() -> None:
         assert not outer.urgent.is_set()
 
 
+def test_inner_context_keeps_the_request_of_the_outer_one() -> None:
+    with Interrupts():
+        with Interrupts() as before:
+            assert before.reason() is None
+        signal.raise_signal(signal.SIGINT)
+        with Interrupts() as after:
+            assert after.reason() is EndReason.STOP_REQUESTED
+
+
 def test_many_signals_do_not_deadlock_their_handlers() -> None:
     """A signal interrupts the handler of another one at any instruction; a lock in the handlers would deadlock."""
     finished = threading.Event()

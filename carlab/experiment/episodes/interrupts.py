@@ -48,7 +48,7 @@ class Flag:
 
 
 class Interrupts:
-    """Context in which signals become stop requests (main thread only)."""
+    """Context in which signals become stop requests (main thread only); an inner context keeps an earlier request."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -60,6 +60,9 @@ class Interrupts:
     def __enter__(self) -> Self:
         for number in SIGNALS:
             self._previous[number] = signal.signal(number, self._handle)
+            outer = getattr(self._previous[number], "__self__", None)
+            if isinstance(outer, Interrupts) and outer.requested.is_set():
+                self.requested.set()
         return self
 
     def __exit__(self, *exc_info: object) -> None:

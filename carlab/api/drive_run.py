@@ -1,0 +1,95 @@
+"""The result of ``carlab.drive`` and its picture."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from carlab.api.runs import html_picture, html_table
+from carlab.core.errors import add_sentence
+
+if TYPE_CHECKING:
+    from carlab.core.outcome import EndReason
+    from carlab.experiment.episodes.session import EpisodeResult
+    from carlab.recording import RunDirectory
+
+log = logging.getLogger(__name__)
+
+PICTURE_FILE = "summary.png"
+
+
+@dataclass(frozen=True)
+class DriveRun:
+    """Result of ``carlab.drive``.
+
+    Attributes:
+        folder: the run's folder.
+        episodes: each with ``data`` (arrays), ``reason`` (end reason), ``summary`` (figures of the task), ``path``.
+    """
+
+    folder: Path
+    episodes: tuple[EpisodeResult, ...]
+
+    @property
+    def recordings(self) -> list[Path]:
+        """The MCAP files."""
+        return [episode.path for episode in self.episodes]
+
+    @property
+    def picture(self) -> Path:
+        """Path of the summary picture; the file exists only if it was drawn."""
+        return self.folder / PICTURE_FILE
+
+    @property
+    def end(self) -> EndReason | None:
+        """End reason of the last episode; None without episodes."""
+        return self.episodes[-1].reason if self.episodes else None
+
+    def __repr__(self) -> str:
+        """One line: folder, number of episodes, last end."""
+        end = "nothing driven" if self.end is None else self.end.name.lower()
+        return f"<DriveRun {self.folder}: {len(self.episodes)} episodes, {end}>"
+
+    def _repr_html_(self) -> str:
+        names = list(self.episodes[0].summary) if self.episodes else []
+        rows = [
+            [e.episode, e.data.ticks, e.total_reward, *(float(e.summary[n]) for n in names), e.reason.name.lower()]
+            for e in self.episodes
+        ]
+        return html_table(["episode", "ticks", "return", *names, "end"], rows) + html_picture(self.picture)
+
+
+@contextlib.contextmanager
+def results_kept(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResult]]:
+    """A list for the results of a run; finally their picture is drawn if ``picture``.
+
+    An error within the context gets a sentence with the run's folder if episodes were finished before it.
+    """
+    results: list[EpisodeResult] = []
+    try:
+        yield results
+    except BaseException as error:
+        if results:
+            count = "the episode" if len(results) == 1 else f"the {len(results)} episodes"
+            add_sentence(error, f"{run.path} has {count} before, see result.json.")
+        raise
+    finally:
+        if picture:
+            _draw(results, run.path / PICTURE_FILE)
+
+
+def _draw(results: Sequence[EpisodeResult], path: Path) -> None:
+    """Draw the episodes; ^C leaves out the picture and does not end the program."""
+    from carlab.recording import read_episode, save_summary
+
+    try:
+        episodes = [read_episode(result.path) for result in results if result.path.exists()]
+        if episodes:
+            save_summary(episodes, path)
+    except KeyboardInterrupt:
+        path.unlink(missing_ok=True)
+        log.warning("The picture %s was not drawn because of an interruption.", path)

@@ -1,0 +1,98 @@
+"""The results of ``carlab.drive`` are kept after an error and after ^C."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import carlab
+from carlab.core.errors import ActuatorFaultError, NotReadyError
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import CarState
+from sim_backends.simulated_car import SimulatedCar
+
+
+def drive(out: Path, **options: Any) -> carlab.DriveRun:
+    return carlab.drive("sim", **({"policy": "neutral", "ticks": 5, "out": out, "rerun": False} | options))
+
+
+def fail_at_placing(monkeypatch: pytest.MonkeyPatch, number: int, error: BaseException) -> None:
+    """Let the simulated car fail when it is placed for episode ``number``."""
+    place, calls = SimulatedCar.place, [-1]  # The first call opens the car.
+
+    def failing(self: SimulatedCar, state: CarState) -> bool:
+        calls[0] += 1
+        if calls[0] == number:
+            raise error
+        return place(self, state)
+
+    monkeypatch.setattr(SimulatedCar, "place", failing)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ActuatorFaultError("The VESC does not answer; check its cable."),
+        NotReadyError("The car", ["the port is missing.", "no pose arrived."]),
+        KeyboardInterrupt(),
+        RuntimeError("an error without a sentence"),
+    ],
+)
+def test_error_keeps_finished_episodes_and_names_their_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    fail_at_placing(monkeypatch, 3, error)
+    message = str(error)
+    with pytest.raises(type(error)) as raised:
+        drive(tmp_path, episodes=4)
+    (run,) = tmp_path.iterdir()
+    text = "\n".join((str(raised.value), *getattr(raised.value, "__notes__", ())))
+    assert text.startswith(message)
+    assert f"{run} has the 2 episodes before, see result.json." in text
+    if isinstance(error, carlab.CarlabError):
+        assert str(run) in str(raised.value), "a program that prints the error prints the folder"
+    assert [row["episode"] for row in json.loads((run / "result.json").read_text())["episodes"]] == [1, 2]
+    assert (run / "summary.png").stat().st_size > 0
+
+
+def test_error_before_the_first_episode_names_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fail_at_placing(monkeypatch, 1, ActuatorFaultError("The VESC does not answer."))
+    with pytest.raises(ActuatorFaultError) as raised:
+        drive(tmp_path)
+    assert str(raised.value) == "The VESC does not answer."
+    assert not list(tmp_path.iterdir())
+
+
+def signalling(call: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, with ^C when it is called."""
+
+    def call_after_signal(*args: Any, **options: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return call(*args, **options)
+
+    return call_after_signal
+
+
+@pytest.mark.parametrize("second", ["carlab.recording.save_summary", "sim_backends.simulated_car.SimulatedCar.close"])
+def test_second_interrupt_after_the_drive_loses_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: str
+) -> None:
+    """The first ^C ends the drive at tick 3; the second one comes while the car is closed or the picture is drawn."""
+    import carlab.recording
+
+    original = SimulatedCar.close if second.endswith("close") else carlab.recording.save_summary
+    monkeypatch.setattr(second, signalling(original))
+
+    def on_tick(tick: Any) -> None:
+        if tick.step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    run = drive(tmp_path, episodes=3, hooks=carlab.RunHooks(on_tick=on_tick))
+    assert run.end is EndReason.STOP_REQUESTED
+    assert json.loads((run.folder / "result.json").read_text())["end_reason"] == "STOP_REQUESTED"
+    assert run.picture.is_file() == second.endswith("close"), "^C leaves out the picture"
