@@ -83,13 +83,13 @@ def results_kept(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResul
 
 
 def _draw(results: Sequence[EpisodeResult], path: Path) -> None:
-    """Draw the episodes; ^C leaves out the picture and does not end the program."""
+    """Draw the episodes with complete ticks; an error or ^C leaves out the picture and does not end the program."""
     from carlab.recording import read_episode, save_summary
 
     try:
-        episodes = [read_episode(result.path) for result in results if result.path.exists()]
+        episodes = [read_episode(result.path) for result in results if result.has_recorded_ticks]
         if episodes:
             save_summary(episodes, path)
-    except KeyboardInterrupt:
+    except (Exception, KeyboardInterrupt) as error:
         path.unlink(missing_ok=True)
-        log.warning("The picture %s was not drawn because of an interruption.", path)
+        log.warning("The picture %s was not drawn (%s).", path, str(error) or type(error).__name__)

@@ -155,9 +155,10 @@ class Drive:
         for r in results:
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
-        complete = [r.path for r in results if r.path.exists()]
-        shown = " (summary.png shows it)" if self.picture and complete else ""
-        ending = " View an episode with:" if complete else " No episode is complete."
+        complete = [r.path for r in results if r.has_recorded_ticks]
+        shown = " (summary.png shows it)" if run.picture.is_file() else ""
+        unit = "tick" if any(r.path.exists() for r in results) else "episode"
+        ending = " View an episode with:" if complete else f" No {unit} is complete."
         console.print(f"Recorded in {run.folder}{shown}.{ending}", soft_wrap=True)
         if complete:
             console.print(f"  carlab view {shlex.quote(str(complete[0]))}", soft_wrap=True)

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -56,6 +57,38 @@ def test_no_folder_remains_if_the_car_does_not_open(
     code, _ = carlab("drive", "--ticks", "5", "--out", tmp_path)
     assert code == (130 if isinstance(error, KeyboardInterrupt) else 1)
     assert not list(tmp_path.iterdir())
+
+
+def test_drive_that_ends_before_the_first_tick_has_the_exit_code_of_a_safety_stop(
+    carlab: Carlab, tmp_path: Path
+) -> None:
+    """The task's start pose lies outside this arena."""
+    arena = "[hardware.arena]\ncorners_m = [[-1, -1], [1, -1], [1, 1], [-1, 1]]\n"
+    (tmp_path / "small.toml").write_text(arena)
+    code, text = carlab("drive", "--vehicle", tmp_path / "small.toml", "--out", tmp_path / "runs", "--no-rerun")
+    assert code == 4
+    assert "move it back inside" in text
+    assert "or enlarge the arena" in text
+    assert re.search(r"\b1 0 0\.0 .* geofence", text), "the table has the episode with 0 ticks"
+    assert "No tick is complete." in text
+    assert "carlab view" not in text
+    (result,) = tmp_path.glob("runs/*/result.json")
+    assert json.loads(result.read_text())["end_reason"] == "GEOFENCE"
+
+
+def test_error_of_the_picture_does_not_replace_the_result(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise ValueError("no font")
+
+    monkeypatch.setattr("carlab.recording.save_summary", refuse)
+    code, text = carlab("drive", "--policy", "neutral", "--ticks", "5", "--out", tmp_path, "--no-rerun")
+    assert code == 0
+    assert "Recorded in" in text
+    assert "summary.png shows it" not in text
+    (log,) = tmp_path.glob("*/log.jsonl")
+    assert "was not drawn (no font)" in log.read_text()
 
 
 def test_interrupted_replay_ends_with_stop_requested(

@@ -57,6 +57,11 @@ class EpisodeResult:
         """Sum of rewards."""
         return float(np.sum(self.data.rewards))
 
+    @property
+    def has_recorded_ticks(self) -> bool:
+        """Whether the recording exists and has a complete tick; the safety gate can end an episode before its first."""
+        return self.data.ticks > 0 and self.path.exists()
+
 
 def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
     """Result of a recorded episode. Raises ConfigError if the task cannot evaluate it."""
