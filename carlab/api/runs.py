@@ -53,8 +53,8 @@ class RunHooks:
         on_tick: receives each tick.
         on_document: receives each document of the control loop; it must return at once.
         on_result: receives each finished episode.
-        on_abandon: receives reason and detail after the control loop hung and the car was stopped; it must end the
-            process.
+        on_abandon: receives reason and detail after the control loop hung and the car was stopped; it may end the
+            process. Otherwise SafetyStop is raised if the loop resumes.
     """
 
     on_start: Callable[[Path, Car], None] = lambda folder, car: None

@@ -15,7 +15,7 @@ from carlab.core.documents import Document, EpisodeEnded
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Observation
-from carlab.core.safety import SafetyEnvelope
+from carlab.core.safety import SafetyEnvelope, SafetyStop
 from carlab.core.task import ParkingTask
 from carlab.experiment.episodes import session as session_module
 from carlab.experiment.episodes.session import Session, SessionHooks, wait_until_still
@@ -162,10 +162,51 @@ def test_hung_loop_that_resumes_does_not_end_the_episode_twice(
     ends = [d for d in SpyRecorder.emitted if isinstance(d, EpisodeEnded)]
     expected = EndReason.POLICY_FINISHED if after_the_end else EndReason.LOOP_HUNG
     assert [e.reason for e in ends] == [expected]
+    assert results[0].reason is expected
+    with pytest.raises(SafetyStop, match="The loop hung while"):
+        session.drive(1)
     recording = read_episode(results[0].path)
     assert recording.metadata["end_reason"] == expected.name
     if not after_the_end:
         assert "inside the policy" in recording.metadata["end_detail"]
+
+
+def test_slow_policy_of_a_car_in_simulated_time_is_no_hanging_loop(tmp_path: Path) -> None:
+    """The watchdog thread polls every 0.05 s, so it would act within the 0.5 s."""
+
+    class SlowPolicy(Forward):
+        def act(self, view: PolicyInput) -> Action | None:
+            if view.step == 2:
+                time.sleep(0.5)
+            return super().act(view)
+
+    abandoned: list[EndReason] = []
+    with SimulatedCar() as car:
+        hooks = SessionHooks(on_abandon=lambda reason, detail: abandoned.append(reason))
+        session = make_session(car, SlowPolicy(), tmp_path, hooks, hang_timeout_s=0.1, max_ticks=5)
+        (result,) = session.drive(1)
+    assert result.reason is EndReason.COMPLETED
+    assert abandoned == []
+
+
+def test_loop_that_resumes_after_the_car_was_closed_raises_where_it_hung(tmp_path: Path) -> None:
+    abandoned = threading.Event()
+
+    class HangingPolicy(Forward):
+        def act(self, view: PolicyInput) -> Action | None:
+            if view.step == 5:
+                assert abandoned.wait(TIMEOUT_S)
+            return super().act(view)
+
+    with SimulatedCar(clock=MonotonicClock()) as car:
+        hooks = SessionHooks(on_abandon=lambda reason, detail: abandoned.set())
+        session = make_session(car, HangingPolicy(), tmp_path, hooks, hang_timeout_s=0.4)
+        with pytest.raises(SafetyStop, match="The loop hung while inside the policy 'forward'") as raised:
+            session.drive(2)
+    assert raised.value.reason is EndReason.LOOP_HUNG
+    (recording,) = tmp_path.glob("*/episodes/*.mcap")
+    assert f"The recording is {recording}." in str(raised.value)
+    assert read_episode(recording).metadata["end_reason"] == "LOOP_HUNG"
 
 
 @pytest.mark.parametrize(

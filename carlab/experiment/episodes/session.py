@@ -2,6 +2,7 @@
 
 The car is opened once; each episode has its own recorder. Signals request the end of the loop. If the loop does not
 end, a watchdog thread stops the car, writes the reason into the recording, finishes the files and calls ``on_abandon``.
+A simulated clock stands still while the loop hangs, so there only a second signal starts the watchdog.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import functools
 import gc
 import logging
+import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,15 +20,15 @@ from pathlib import Path
 import numpy as np
 
 from carlab.core.car import Car
-from carlab.core.clock import wall_clock_ns
+from carlab.core.clock import SimulatedClock, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import ConfigError, PoseLostError
+from carlab.core.errors import ConfigError, PoseLostError, add_sentence
 from carlab.core.observation import episode_features
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy
 from carlab.core.quantities import CarState
-from carlab.core.safety import SafetyEnvelope
+from carlab.core.safety import SafetyEnvelope, SafetyStop
 from carlab.core.task import Task
 from carlab.experiment.episodes.episode import EpisodeHooks, run_episode
 from carlab.experiment.episodes.interrupts import Interrupts, LoopWatch
@@ -85,7 +87,8 @@ class SessionHooks:
     ``place_by_hand`` is called if the car cannot move to its start pose by itself; it returns when the car is there.
     ``on_tick`` receives each tick, for a progress bar. ``on_document`` receives each document in the control loop, and
     returns at once. ``stop_reason`` may end an episode (dead-man control).
-    ``on_abandon`` is called last if the loop hung, with reason and detail; it must end the process.
+    ``on_abandon`` is called last if the loop hung, with reason and detail; it may end the process. Otherwise, if the
+    loop resumes, the session raises SafetyStop with them.
     """
 
     place_by_hand: Callable[[CarState], None] = lambda start: None
@@ -115,13 +118,20 @@ class Session:
     hang_timeout_s: float = 2.0
     place: bool = True
     record_rerun: bool = True
+    _abandoned: SafetyStop | None = field(default=None, init=False)
 
     def drive(self, episodes: int) -> list[EpisodeResult]:
-        """Drive episodes; ends early on a stop request or after a safety stop. Raises the errors of run_episode."""
+        """Drive episodes; ends early on a stop request or after a safety stop.
+
+        Raises:
+            SafetyStop: the loop hung and the watchdog thread stopped the car. Other errors: those of run_episode.
+        """
         results: list[EpisodeResult] = []
         starts = np.random.SeedSequence(self.seed).spawn(episodes)
         with Interrupts() as interrupts:
             for index in range(episodes):
+                if self._abandoned is not None:
+                    raise self._abandoned
                 start = self.task.sample_start(np.random.default_rng(starts[index]))
                 if not (self.place and self.car.place(start)):
                     if self.place:
@@ -145,7 +155,8 @@ class Session:
         recorder = Recorder(sinks)
         emitter = _Emitter(recorder, self.hooks)
         abandon = functools.partial(self._abandon, recorder, emitter, interrupts)
-        watch = LoopWatch(abandon, timeout_s=self.hang_timeout_s, urgent=interrupts.urgent)
+        timeout_s = math.inf if isinstance(self.car.clock, SimulatedClock) else self.hang_timeout_s
+        watch = LoopWatch(abandon, timeout_s=timeout_s, urgent=interrupts.urgent)
         hooks = EpisodeHooks(
             emit=emitter.emit,
             stop_requested=lambda: interrupts.reason() or self.hooks.stop_reason(),
@@ -153,21 +164,29 @@ class Session:
             heartbeat=watch.beat,
         )
         self.hooks.on_episode(number, self.task.max_ticks if self.max_ticks is None else self.max_ticks)
-        with _objects_frozen(), recorder, _logged(recorder), watch:
-            data = run_episode(
-                self.car,
-                self.policy,
-                self.task,
-                self.envelope,
-                period_s=self.period_s,
-                max_ticks=self.max_ticks,
-                hooks=hooks,
-                episode=number,
-                seed=self.seed,
-                config_toml=self.config_toml,
-                metadata=self.metadata,
-            )
-            watch.pause()
+        try:
+            with _objects_frozen(), recorder, _logged(recorder), watch:
+                data = run_episode(
+                    self.car,
+                    self.policy,
+                    self.task,
+                    self.envelope,
+                    period_s=self.period_s,
+                    max_ticks=self.max_ticks,
+                    hooks=hooks,
+                    episode=number,
+                    seed=self.seed,
+                    config_toml=self.config_toml,
+                    metadata=self.metadata,
+                )
+                watch.pause()
+        except Exception as error:
+            if self._abandoned is not None:
+                add_sentence(self._abandoned, f"The recording is {path}.")
+                raise self._abandoned from error
+            raise
+        if emitter.hung is not None:
+            data = _with_end(data, emitter.hung.reason, emitter.hung.detail)
         return result_of(number, _with_recorder_error(data, recorder.failed), self.task, path)
 
     def _abandon(self, recorder: Recorder, emitter: _Emitter, interrupts: Interrupts, where: str, stack: str) -> None:
@@ -175,12 +194,14 @@ class Session:
         reason = EndReason.STOP_REQUESTED if interrupts.urgent.is_set() else EndReason.LOOP_HUNG
         detail = f"The loop hung while {where}."
         log_text = f"The control loop hangs while {where}:\n{stack}"
+        self._abandoned = SafetyStop(reason, detail)
         ends_episode = emitter.claim_end()
         with contextlib.suppress(Exception):
             self.car.stop(planned=False)
         tick = emitter.last_tick
         t_s = tick.t_s if tick is not None else self.car.clock.now_s()
         if ends_episode:
+            emitter.hung = self._abandoned
             recorder.emit(LogLine(wall_clock_ns(), logging.CRITICAL, __name__, log_text))
             recorder.emit(EpisodeEnded(t_s, reason, detail, tick.step if tick is not None else 0, float("nan")))
         recorder.close()
@@ -193,7 +214,8 @@ class Session:
 class _Emitter:
     """Passes documents to a recorder until the episode has ended.
 
-    Either the loop or the watchdog thread ends the episode; later documents of the loop are discarded.
+    Either the loop or the watchdog thread ends the episode; later documents of the loop are discarded. ``hung`` is the
+    end by the watchdog thread.
     """
 
     def __init__(self, recorder: Recorder, hooks: SessionHooks) -> None:
@@ -201,6 +223,7 @@ class _Emitter:
         self._lock = threading.Lock()
         self._ended = False
         self.last_tick: Tick | None = None
+        self.hung: SafetyStop | None = None
 
     def claim_end(self) -> bool:
         """Whether the caller is the first to end the episode."""
@@ -222,8 +245,11 @@ def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:
     """Set the end reason to RECORDER_ERROR if the recording failed, unless the episode ended with a safety stop."""
     if failed is None or EndReason[data.metadata["end_reason"]].is_safety_stop:
         return data
-    reason = EndReason.RECORDER_ERROR
-    end = {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": failed}
+    return _with_end(data, EndReason.RECORDER_ERROR, failed)
+
+
+def _with_end(data: EpisodeData, reason: EndReason, detail: str) -> EpisodeData:
+    end = {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
     return replace(data, metadata={**data.metadata, **end})
 
 
