@@ -31,9 +31,9 @@ def load_car(car: str | Path | CarFile = "sim") -> CarFile:
 
 
 def car_options_text(
-    car: str | CarFile,
-    vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None,
+    car: str | Path | CarFile,
+    vehicle: str | Path | CarFile | None = None,
+    reality: str | Path | CarFile | None = None,
     dry_run: bool = False,
 ) -> str:
     """Command-line options that select a car, each with a leading space; options with default values are omitted."""

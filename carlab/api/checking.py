@@ -49,14 +49,14 @@ class CarCheck:
 
 
 def check(
-    car: str | CarFile = "sim",
+    car: str | Path | CarFile = "sim",
     *,
     task: str | Task | None = None,
     track: Path | str | None = None,
     seconds: float = 2.0,
     wheels: bool = True,
-    vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None,
+    vehicle: str | Path | CarFile | None = None,
+    reality: str | Path | CarFile | None = None,
     dry_run: bool = False,
     hooks: RunHooks | None = None,
 ) -> CarCheck:

@@ -44,11 +44,11 @@ TELEOP_MAX_TICKS = 10**6
 
 
 def drive(
-    car: str | CarFile = "sim", *, policy: str | Path | Policy = "parking", task: str | Task | None = None,
+    car: str | Path | CarFile = "sim", *, policy: str | Path | Policy = "parking", task: str | Task | None = None,
     track: Path | str | None = None, episodes: int = 1, ticks: int | None = None, seed: int = 0,
     max_throttle: float | None = None, place: bool = True, out: Path | str = "runs", name: str = "drive",
     rerun: bool = True, picture: bool = True, live: bool = False, viewer: str | None = None,
-    vehicle: Path | CarFile | None = None, reality: Path | CarFile | None = None, dry_run: bool = False,
+    vehicle: str | Path | CarFile | None = None, reality: str | Path | CarFile | None = None, dry_run: bool = False,
     hooks: RunHooks | None = None,
 ) -> DriveRun:  # fmt: skip
     """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
@@ -109,13 +109,13 @@ def drive(
 
 def replay(
     recording: Path | str | Recording,
-    car: str | CarFile = "sim",
+    car: str | Path | CarFile = "sim",
     *,
     seconds: float | None = None,
     seed: int = 0,
     out: Path | str = "runs",
-    vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None,
+    vehicle: str | Path | CarFile | None = None,
+    reality: str | Path | CarFile | None = None,
     dry_run: bool = False,
     hooks: RunHooks | None = None,
 ) -> tuple[EpisodeData, DriveRun]:

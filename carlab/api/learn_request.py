@@ -28,7 +28,7 @@ Device = Literal["cpu", "cuda"]
 class LearnRequest:
     """The arguments of ``learn``."""
 
-    car: str | CarFile
+    car: str | Path | CarFile
     episodes: int | None
     ticks: int | None
     prior: str | Path | CarFile
@@ -45,8 +45,8 @@ class LearnRequest:
     rerun: bool
     live: bool
     viewer: str | None
-    vehicle: Path | CarFile | None
-    reality: Path | CarFile | None
+    vehicle: str | Path | CarFile | None
+    reality: str | Path | CarFile | None
     dry_run: bool
     task: str | Task | None
     track: Path | str | None
@@ -106,8 +106,8 @@ def _prior_file(prior: str | Path | CarFile) -> CarFile:
     return load_car_file(file)
 
 
-def _name_of(car: str | CarFile) -> str:
-    return car if isinstance(car, str) else car.name
+def _name_of(car: str | Path | CarFile) -> str:
+    return str(car) if isinstance(car, (str, Path)) else car.name
 
 
 def checked_simulator(request: LearnRequest) -> SimulatorConfig | None:

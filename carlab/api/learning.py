@@ -133,13 +133,13 @@ class LearnRun:
 
 
 def learn(
-    car: str | CarFile = "sim", *, task: str | Task | None = None, track: Path | str | None = None,
+    car: str | Path | CarFile = "sim", *, task: str | Task | None = None, track: Path | str | None = None,
     episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile = "kinematic",
     method: Method = "gp-sim-posterior", history: int | None = None, model_steps: int | None = None,
     updates: int = 30000, seed: int = 0, device: Device | None = None, place: bool = True,
     resume: Path | str | None = None, out: Path | str = "runs", name: str = "learn", rerun: bool = True,
-    live: bool = False, viewer: str | None = None, vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
+    live: bool = False, viewer: str | None = None, vehicle: str | Path | CarFile | None = None,
+    reality: str | Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
     hooks: LearnHooks | None = None,
 ) -> LearnRun:  # fmt: skip
     """Fit a model of the car (the learned car), train a policy in it, drive an episode with the policy, and repeat.

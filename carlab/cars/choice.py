@@ -44,10 +44,10 @@ class CarChoice:
 
 
 def choose_car(
-    name: str | CarFile,
+    name: str | Path | CarFile,
     *,
-    vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None,
+    vehicle: str | Path | CarFile | None = None,
+    reality: str | Path | CarFile | None = None,
     dry_run: bool = False,
     seed: int = 0,
     log_folder: Path | None = None,
@@ -57,7 +57,7 @@ def choose_car(
     Args:
         name: sim, emulated, emulated-can, the name of a plug-in (entry point group ``carlab.cars``: a callable that
             takes a CarFile and a seed and returns a CarChoice), a preset (simulated),
-            the path of a car file, or a car file that was read.
+            the path of a car file (``str`` or ``Path``), or a car file that was read.
         vehicle: car file whose physics sim, emulated and plug-ins use; the default car without it.
         reality: car file with the true physics of a simulated or emulated car, while ``CarChoice.simulator`` and the
             recordings keep the parameters of the other file; by default the same file.
@@ -80,16 +80,18 @@ def choose_car(
 
 
 def _choose(
-    name: str | CarFile, vehicle: Path | CarFile | None, reality: Path | CarFile | None, seed: int
+    name: str | Path | CarFile, vehicle: str | Path | CarFile | None, reality: str | Path | CarFile | None, seed: int
 ) -> CarChoice:
-    truth = None if reality is None else _read(reality).simulator
+    truth = None if reality is None else _read(reality, "--reality").simulator
     plugins = {point.name: point for point in importlib.metadata.entry_points(group=PLUGIN_GROUP)}
     if isinstance(name, str) and name in BUILT_IN:
-        return BUILT_IN[name](default_car() if vehicle is None else _read(vehicle), seed, truth)
+        return BUILT_IN[name](default_car() if vehicle is None else _read(vehicle, "--vehicle"), seed, truth)
     if isinstance(name, str) and name in plugins:
         if truth is not None:
             raise ConfigError(f"--reality needs a simulated or emulated car; '{name}' is a plug-in. Remove --reality.")
-        choice: CarChoice = plugins[name].load()(default_car() if vehicle is None else _read(vehicle), seed)
+        choice: CarChoice = plugins[name].load()(
+            default_car() if vehicle is None else _read(vehicle, "--vehicle"), seed
+        )
         return choice
     if vehicle is not None:
         raise ConfigError(f"--vehicle needs --car sim or emulated; '{_name_of(name)}' has its own physics.")
@@ -100,7 +102,7 @@ def _choose(
                 f"There is no car '{name}'; name one of {', '.join([*BUILT_IN, *plugins, *preset_names()])}, "
                 "or a FILE.toml."
             )
-    file = _read(Path(name) if isinstance(name, str) else name)
+    file = _read(name, "--car")
     if file.real is None:
         return _simulated(file, seed, truth)
     if truth is not None:
@@ -119,12 +121,16 @@ def _check_watchdog(choice: CarChoice) -> None:
         )
 
 
-def _read(car: Path | CarFile) -> CarFile:
-    return car if isinstance(car, CarFile) else load_car_file(car)
+def _read(car: str | Path | CarFile, option: str) -> CarFile:
+    if isinstance(car, CarFile):
+        return car
+    if not isinstance(car, (str, Path)):
+        raise ConfigError(f"{option} {car!r}: give the path of a car file, a preset, or a car file that was read.")
+    return load_car_file(Path(car))
 
 
-def _name_of(car: str | CarFile) -> str:
-    return car.name if isinstance(car, CarFile) else car
+def _name_of(car: str | Path | CarFile) -> str:
+    return car.name if isinstance(car, CarFile) else str(car)
 
 
 def _config_toml(file: CarFile, car: str) -> str:

@@ -1,0 +1,44 @@
+"""Cars are given by names, paths or car files in all calls of the Python API."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import carlab
+from carlab.core.errors import ConfigError
+
+
+@pytest.fixture
+def car_file(tmp_path: Path) -> Path:
+    path = tmp_path / "my_car.toml"
+    path.write_text("[vehicle]\nmass = 2.0\n")
+    return path
+
+
+@pytest.mark.parametrize("kind", [str, Path, carlab.load_car])
+def test_vehicle_is_a_string_a_path_or_a_car_file(tmp_path: Path, car_file: Path, kind: Callable[[Any], Any]) -> None:
+    run = carlab.drive(
+        "sim", policy="neutral", ticks=2, out=tmp_path / "runs", rerun=False, picture=False,
+        vehicle=kind(str(car_file)), reality="eth_rc_car",
+    )  # fmt: skip
+    assert "mass = 2.0" in (run.folder / "config.toml").read_text()
+
+
+def test_strings_are_accepted_by_the_other_calls(tmp_path: Path, car_file: Path) -> None:
+    assert carlab.check("sim", vehicle=str(car_file), seconds=0.2).is_ready
+    run = carlab.drive(car_file, policy="neutral", ticks=5, out=tmp_path / "runs", rerun=False, picture=False)
+    _, replayed = carlab.replay(run.recordings[0], vehicle=str(car_file), out=tmp_path / "runs")
+    assert replayed.recordings
+    with pytest.raises(ConfigError, match=r"There is no car file 'missing.toml'"):
+        carlab.learn("sim", vehicle="missing.toml", out=tmp_path / "runs")
+
+
+@pytest.mark.parametrize("option", ["car", "vehicle", "reality"])
+def test_value_of_another_type_is_refused(tmp_path: Path, option: str) -> None:
+    arguments: dict[str, Any] = {"car": "sim"} | {option: 5}
+    with pytest.raises(ConfigError, match=f"--{option} 5: give the path of a car file"):
+        carlab.drive(**arguments, ticks=2, out=tmp_path)
