@@ -58,7 +58,8 @@ def drive(
     Args:
         car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
         policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
-            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
+            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object with ``name``, ``reset`` and ``act``,
+            see ``carlab.core.policy.Policy``.
         task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
             Without it, a manoeuvre of a simulated or emulated car has no arena.
         track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
@@ -227,12 +228,23 @@ def _check(
         raise ConfigError(
             f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn."
         )
-    if not isinstance(policy, (str, Path)) and not callable(getattr(policy, "act", None)):
-        raise ConfigError(f"--policy {policy!r}: give a name, the folder of a run, or an object with the method act.")
+    if not isinstance(policy, (str, Path)):
+        _check_object(policy)
     if max_throttle is not None and not 0.0 < max_throttle <= 1.0:
         raise ConfigError(f"--max-throttle {max_throttle:g}: give a number above 0 and at most 1.")
     if policy == "keyboard" and not has_screen():
         raise NotReadyError("Keyboard", ["its window needs a screen, which is missing; use --policy gamepad."])
+
+
+def _check_object(policy: Policy) -> None:
+    """Raise ConfigError if an object is no policy; the message names what it lacks."""
+    missing = [f"the method {name}" for name in ("act", "reset") if not callable(getattr(policy, name, None))]
+    missing += [] if isinstance(getattr(policy, "name", None), str) else ["the attribute name (a string)"]
+    if missing:
+        raise ConfigError(
+            f"--policy {policy!r}: give a name, the folder of a run, or an object like carlab.core.policy.Policy; "
+            f"this one lacks {' and '.join(missing)}."
+        )
 
 
 def _policy_and_task(

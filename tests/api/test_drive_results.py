@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import carlab
-from carlab.core.errors import ActuatorFaultError, NotReadyError
+from carlab.core.errors import ActuatorFaultError, ConfigError, NotReadyError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import CarState
 from sim_backends.simulated_car import SimulatedCar
@@ -96,3 +96,14 @@ def test_second_interrupt_after_the_drive_loses_no_result(
     assert run.end is EndReason.STOP_REQUESTED
     assert json.loads((run.folder / "result.json").read_text())["end_reason"] == "STOP_REQUESTED"
     assert run.picture.is_file() == second.endswith("close"), "^C leaves out the picture"
+
+
+def test_object_that_is_no_policy_is_refused_with_what_it_lacks(tmp_path: Path) -> None:
+    class Nameless:
+        def act(self, view: object) -> None: ...
+
+    with pytest.raises(ConfigError, match=r"this one lacks the method reset and the attribute name \(a string\)"):
+        drive(tmp_path, policy=Nameless())
+    with pytest.raises(ConfigError, match="this one lacks the method act and the method reset and"):
+        drive(tmp_path, policy=3)
+    assert not list(tmp_path.iterdir())

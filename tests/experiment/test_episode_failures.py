@@ -206,6 +206,37 @@ def test_policy_output_that_is_no_action_ends_with_policy_error(output: object) 
     assert not any(isinstance(d, Tick) for d in documents)
 
 
+@pytest.mark.parametrize(
+    "action",
+    [
+        Action(np.array([0.1]), np.array([0.1])),
+        Action("a", 0.0),
+        Action(np.array("a"), 0.0),
+        Action(None, 0.0),
+        Action(0.0, 10**400),
+    ],
+)
+def test_action_that_is_no_pair_of_numbers_ends_with_policy_error(action: Action) -> None:
+    injector = FaultInjector()
+    with FaultyCar(injector) as car:
+        documents, raised = drive(car, injector, FaultyPolicy(injector, lambda view: action))
+        assert raised is None
+        assert car.stops[-1] is False
+    assert isinstance(documents[-1], EpisodeEnded)
+    assert documents[-1].reason is EndReason.POLICY_ERROR
+    assert "steering and throttle must be single numbers" in documents[-1].detail
+
+
+@pytest.mark.parametrize("action", [Action(np.float32(0.25), np.int64(0)), Action(np.array(0.25), np.array(0))])
+def test_numbers_of_numpy_are_an_action(action: Action) -> None:
+    injector = FaultInjector()
+    with FaultyCar(injector) as car:
+        documents, _ = drive(car, injector, FaultyPolicy(injector, lambda view: action))
+    ticks = [document for document in documents if isinstance(document, Tick)]
+    assert ticks[0].requested == Action(0.25, 0.0)
+    assert isinstance(ticks[0].requested.steering, float)
+
+
 def test_slow_policy_ends_with_late_loop_and_not_with_a_pose_fault() -> None:
     injector = FaultInjector()
     with FaultyCar(injector) as car:

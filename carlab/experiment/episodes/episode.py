@@ -11,6 +11,7 @@ import contextlib
 import json
 import logging
 import math
+import numbers
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -283,7 +284,17 @@ def _act(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeo
     policy_s = car.clock.now_s() - began_s
     if policy_s > timeout_s:
         raise _End(EndReason.LATE_LOOP, f"The policy '{policy.name}' took {policy_s:.1f} s for one tick.")
-    return action, policy_s
+    return _as_numbers(action), policy_s
+
+
+def _as_numbers(action: Action) -> Action:
+    """The action as Python numbers. Raises _End if a channel is no number, for example an array of shape (1,)."""
+    channels: tuple[object, object] = (action.steering, action.throttle)
+    # Scalars of array libraries (0 dimensions) count as numbers.
+    if all(isinstance(value, numbers.Real) or getattr(value, "ndim", None) == 0 for value in channels):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            return Action(float(action.steering), float(action.throttle))
+    raise _End(EndReason.POLICY_ERROR, f"It returned {action}; steering and throttle must be single numbers.")
 
 
 def _evaluate_transition(
