@@ -53,13 +53,10 @@ def drive(
 ) -> DriveRun:  # fmt: skip
     """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
 
-    result.json is written after each episode, so an error or ^C loses no finished episode.
-
     Args:
         car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
         policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
-            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object with ``name``, ``reset`` and ``act``,
-            see ``carlab.core.policy.Policy``.
+            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
         task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
             Without it, a manoeuvre of a simulated or emulated car has no arena.
         track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
@@ -69,7 +66,7 @@ def drive(
         seed: of start poses and sensor noise.
         max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
         place: start each episode at the task's start pose; False: at the car's current pose.
-        out: parent of the run's folder.
+        out: parent of the run's folder, whose result.json is written after each episode.
         name: last part of the run folder's name.
         rerun: also record .rrd files.
         picture: draw summary.png.
@@ -84,8 +81,8 @@ def drive(
         The run; ``episodes`` is empty if it was interrupted before the first.
 
     Raises:
-        ConfigError, DataError: an argument is invalid, or a file cannot be written.
-        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
+        ConfigError, DataError: an argument is invalid, a file cannot be written, or this is not the main thread.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control loop hung.
     """
     from carlab.cars import choose_car
 
@@ -222,6 +219,9 @@ def _policy_names() -> tuple[str, ...]:
 def _check(
     policy: str | Path | Policy, max_throttle: float | None, *, episodes: int, ticks: int | None, seed: int
 ) -> None:
+    from carlab.experiment.episodes.interrupts import check_main_thread
+
+    check_main_thread()
     at_least(1, episodes=episodes, ticks=ticks)
     at_least(0, seed=seed)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():

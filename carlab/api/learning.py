@@ -301,8 +301,10 @@ def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
 
 
 def _check(request: LearnRequest) -> None:
+    from carlab.experiment.episodes.interrupts import check_main_thread
     from learning.devices import available
 
+    check_main_thread()
     counts = {name: getattr(request, name) for name in ("episodes", "updates", "ticks", "model_steps")}
     above_zero(**counts)
     whole_number(**counts)

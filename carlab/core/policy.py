@@ -20,7 +20,7 @@ class PolicyInput:
 
 @runtime_checkable
 class Policy(Protocol):
-    """A policy: one action per tick. ``act`` returns None at the end of a script."""
+    """A policy: one action per tick. ``act`` returns None at the end of a script; ``name`` is written to recordings."""
 
     name: str
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -106,4 +107,23 @@ def test_object_that_is_no_policy_is_refused_with_what_it_lacks(tmp_path: Path) 
         drive(tmp_path, policy=Nameless())
     with pytest.raises(ConfigError, match="this one lacks the method act and the method reset and"):
         drive(tmp_path, policy=3)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("call", [carlab.drive, carlab.learn])
+def test_driving_outside_the_main_thread_is_refused(tmp_path: Path, call: Callable[..., Any]) -> None:
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call("sim", out=tmp_path)
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    (error,) = errors
+    assert isinstance(error, ConfigError)
+    assert "call carlab in the main thread, or in a process of its own." in str(error)
     assert not list(tmp_path.iterdir())

@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any, Self
 
 from carlab.core.clock import MonotonicClock
+from carlab.core.errors import ConfigError
 from carlab.core.outcome import EndReason
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -47,8 +48,21 @@ class Flag:
         return self._is_set
 
 
+def check_main_thread() -> None:
+    """Raise ConfigError outside the main thread, which alone can receive signals."""
+    if threading.current_thread() is not threading.main_thread():
+        raise ConfigError(
+            "A car is driven from the main thread only, because ^C does not reach another one and could not stop the "
+            "car; call carlab in the main thread, or in a process of its own."
+        )
+
+
 class Interrupts:
-    """Context in which signals become stop requests (main thread only); an inner context keeps an earlier request."""
+    """Context in which signals become stop requests; an inner context keeps an earlier request.
+
+    Raises:
+        ConfigError: it is entered outside the main thread.
+    """
 
     def __init__(self) -> None:
         self.count = 0
@@ -58,6 +72,7 @@ class Interrupts:
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
+        check_main_thread()
         for number in SIGNALS:
             self._previous[number] = signal.signal(number, self._handle)
             outer = getattr(self._previous[number], "__self__", None)
