@@ -56,9 +56,12 @@ class ParameterInfo:
         return None
 
 
+MIN_MASS_KG = 0.05
+"""Lower limit of the mass [kg]: the smallest model cars (1:64) weigh about as much. It refuses a mass in tonnes."""
+
 _INF = math.inf
 _BASE = (
-    ParameterInfo("vehicle.mass", "kg", 1.65, 0.0, 500.0, True, "mass_kg"),
+    ParameterInfo("vehicle.mass", "kg", 1.65, MIN_MASS_KG, 500.0, True, "mass_kg"),
     ParameterInfo("vehicle.yaw_inertia", "kg m2", 0.06, 0.0, _INF, True, "yaw_inertia_kgm2"),
     ParameterInfo("vehicle.front_axle", "m", 0.13, 0.0, 10.0, True, "front_axle_m"),
     ParameterInfo("vehicle.rear_axle", "m", 0.17, 0.0, 10.0, True, "rear_axle_m"),

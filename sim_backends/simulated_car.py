@@ -8,14 +8,17 @@ from dataclasses import astuple
 from carlab.core.angles import wrap
 from carlab.core.car import Car
 from carlab.core.clock import Clock, SimulatedClock
-from carlab.core.errors import ActuatorFaultError, NotArmedError, NotOpenError, PoseLostError
+from carlab.core.errors import ActuatorFaultError, CarlabError, NotArmedError, NotOpenError, PoseLostError
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Health, Observation, PoseSample, Reality
 from carlab.core.state_estimator import StateEstimator
 from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.divergence import DivergenceLimits, diverged, is_physical
 from sim_backends.measurement import MeasurementModel, State, filter_step
 from sim_backends.plant import Plant, Pose
 from sim_backends.sensor import MocapSensor
+
+DIVERGENCE_LIMITS = DivergenceLimits()
 
 
 class _Approach:
@@ -128,7 +131,13 @@ class SimulatedCar(Car):
         return self._plant.state
 
     def observe(self) -> Observation:
-        """Newest state that has arrived. Raises PoseLostError before the first pose, NotOpenError when closed."""
+        """Newest state that has arrived.
+
+        Raises:
+            PoseLostError: before the first pose.
+            NotOpenError: the car is closed.
+            ConfigError: the simulation diverged.
+        """
         self._require_open()
         self._run_to(self.clock.now_s())
         estimate, newest = self._estimator.estimate(), self._estimator.newest
@@ -221,9 +230,18 @@ class SimulatedCar(Car):
             self._watchdog_trips += 1
 
     def _run_to(self, now_s: float) -> None:
+        """Simulate up to a time [s]. Raises ConfigError if the simulation diverges."""
         self._run_watchdog(now_s)
-        self._take_in(self._sensor.samples_until(now_s, self._plant))
-        self._plant.advance(now_s)
+        try:
+            samples = self._sensor.samples_until(now_s, self._plant)
+            state = self._plant.advance(now_s)
+        except (OverflowError, ValueError) as error:  # Functions of infinite numbers, such as their sine.
+            if isinstance(error, CarlabError):
+                raise
+            raise diverged(self.name) from error
+        if not is_physical(state, DIVERGENCE_LIMITS):
+            raise diverged(self.name)
+        self._take_in(samples)
 
     def _take_in(self, samples: list[PoseSample]) -> None:
         for sample in samples:

@@ -91,6 +91,15 @@ def test_error_of_the_picture_does_not_replace_the_result(
     assert "was not drawn (no font)" in log.read_text()
 
 
+def test_diverging_simulation_is_not_blamed_on_motion_capture(carlab: Carlab, tmp_path: Path) -> None:
+    (tmp_path / "stiff.toml").write_text("[motor]\ndamping = 1560\n")
+    options = ("--policy", "figure_eight", "--ticks", "60", "--out", tmp_path / "runs", "--no-rerun")
+    code, text = carlab("drive", "--car", tmp_path / "stiff.toml", *options)
+    assert code == 2
+    assert "The simulation of car 'stiff' diverged" in text
+    assert "Motive" not in text
+
+
 def test_interrupted_replay_ends_with_stop_requested(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -85,6 +85,7 @@ def test_toml_round_trip_keeps_effects_and_priors():
         ({"hardware": {}}, "Unknown key 'hardware'"),
         ({"vehicle": {"mass": 0.0}}, "vehicle.mass is 0 kg; it must be greater than 0"),
         ({"vehicle": {"mass": -1.0}}, "it must be greater than 0"),
+        ({"vehicle": {"mass": 0.00165}}, "vehicle.mass is 0.00165 kg; it must be greater than 0.05 (SI units"),
         ({"vehicle": {"mass": "heavy"}}, "must be a number"),
         ({"vehicle": {"mass": True}}, "must be a number"),
         ({"vehicle": {"mass": float("nan")}}, "give a finite number in kg"),

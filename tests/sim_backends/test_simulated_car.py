@@ -1,6 +1,7 @@
 """Test that the simulated car implements the car interface."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +10,14 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.errors import (
     ActionOutOfRangeError,
     ActuatorFaultError,
+    ConfigError,
     NotArmedError,
     NotOpenError,
     PoseLostError,
 )
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Reality
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
+from sim_backends.divergence import DivergenceLimits, is_physical
 from sim_backends.simulated_car import SimulatedCar
 
 QUIET = MocapParameters(position_std_m=0.0, yaw_std_rad=0.0)
@@ -107,6 +110,26 @@ def test_open_and_close_are_idempotent():
     car.open()
     assert car.observe().tracked
     car.close()
+
+
+@pytest.mark.parametrize("damping_nspm", [800.0, 1560.0, 1e150])
+def test_diverging_simulation_is_an_error_of_the_car_file(damping_nspm):
+    """A Runge-Kutta step of 10 ms is unstable for a rate above 279 1/s: damping above 460 N s/m at 1.65 kg."""
+    config = SimulatorConfig().with_values({"motor.damping": damping_nspm})
+    with SimulatedCar(config) as car:
+        car.arm()
+        with pytest.raises(ConfigError, match=r"diverged.* Check mass, yaw_inertia, damping"):
+            drive(car, [Action(0.3, 0.4)] * 60)
+
+
+def test_state_at_the_limits_of_speed_and_yaw_rate_is_physical():
+    limits = DivergenceLimits()
+    fast = CarState(vx_mps=limits.max_speed_mps, yaw_rate_radps=-limits.max_yaw_rate_radps)
+    assert is_physical(fast, limits)
+    assert not is_physical(replace(fast, vy_mps=10.0), limits)
+    assert not is_physical(replace(fast, yaw_rate_radps=-limits.max_yaw_rate_radps - 1.0), limits)
+    assert not is_physical(CarState(x_m=math.inf), limits)
+    assert not is_physical(CarState(yaw_rad=math.nan), limits)
 
 
 def test_watchdog_replaces_an_old_command_by_neutral():
