@@ -26,7 +26,7 @@ def test_run_folder_is_one_recording_of_its_episodes(
     assert picture.read_bytes().startswith(b"\x89PNG")
     steps = cells(file, "Scalars:scalars", "episode")["episode/tick/policy_ms"]
     assert [number for number, cell in steps if cell[0] == cell[0]] == [1] * 5 + [2] * 5
-    assert set(tabs(file)) == {"Drive by episode", "Link"}
+    assert set(tabs(file)) == {"Drive by episode", "Latency and health"}
     code, text = carlab("view", run, "--save", file)
     assert code == 1
     assert "exists already" in text
