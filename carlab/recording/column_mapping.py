@@ -43,6 +43,20 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 
 
 @dataclass(frozen=True, slots=True)
+class MappingSettings:
+    """Limits of what a mapping may declare, each with unit and reason."""
+
+    max_lag_s: float = 1.0
+    """[s] A declared lag of velocities or commands is at most this long; longer ones are in milliseconds. The slowest
+    known logger lags 0.1 s behind."""
+    max_lag_share: float = 0.1
+    """Share of a recording. A shift by a longer lag replaces more commands than this by the first or last one."""
+
+
+MAPPING_LIMITS = MappingSettings()
+
+
+@dataclass(frozen=True, slots=True)
 class ColumnSource:
     """Where one channel comes from: value = sign * scale * (factor of ``unit``) * column."""
 
@@ -72,7 +86,7 @@ class ColumnMapping:
     """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``.
 
     Raises:
-        ConfigError: an unknown channel or unit, or a scale or rate that is out of range.
+        ConfigError: an unknown channel or unit, or a scale, rate or lag that is out of range.
     """
 
     columns: Mapping[str, ColumnSource]
@@ -116,6 +130,8 @@ class ColumnMapping:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
         if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
             raise ConfigError(f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero.")
+        _check_lag("velocity_lag", self.velocity_lag_s)
+        _check_lag("command_lag", self.command_lag_s)
         for channel, source in self.columns.items():
             source.factor(channel)
         check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
@@ -134,6 +150,15 @@ class ColumnMapping:
             source = dataclasses.asdict(sources.get(channel, ColumnSource(channel)))
             sources[channel] = from_table(ColumnSource, {**source, **changes}, f"the changes to {channel}")
         return dataclasses.replace(self, columns=sources, **{name: getattr(checked, name) for name in options})
+
+
+def _check_lag(option: str, lag_s: float) -> None:
+    """Raise ConfigError for a lag [s] that no logger has."""
+    if not abs(lag_s) <= MAPPING_LIMITS.max_lag_s:
+        raise ConfigError(
+            f"{option} is {lag_s:g} s, but a lag is at most {MAPPING_LIMITS.max_lag_s:g} s; give it in seconds, for "
+            "example 0.05 for 50 ms."
+        )
 
 
 def load_mapping(path: Path | str) -> ColumnMapping:

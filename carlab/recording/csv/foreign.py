@@ -19,6 +19,7 @@ from carlab.recording.audit.file_checks import check_jumps, check_missing, check
 from carlab.recording.audit.report import AuditReport, Finding, Severity, raise_errors
 from carlab.recording.column_mapping import (
     CHANNELS,
+    MAPPING_LIMITS,
     VELOCITY_CHANNELS,
     ColumnMapping,
     missing_columns,
@@ -67,7 +68,8 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
 
     Raises:
         DataError: the file is not a CSV, a column is missing, a cell is not a number, time does not increase or has
-            gaps, undeclared units are evidently not SI, or commands exceed [-1, 1]. Other findings are reported only.
+            gaps, undeclared units are evidently not SI, commands exceed [-1, 1], or the command lag is too long for
+            the recording. Other findings are reported only.
     """
     table = read_csv(path)
     source = table.path.name
@@ -282,6 +284,12 @@ def _commands(
         sent[:, 1] *= channels.extra[mapping.throttle_gate]
     if not mapping.command_lag_s:
         return requested, sent, []
+    duration_s = float(t_s[-1] - t_s[0])
+    if abs(mapping.command_lag_s) > MAPPING_LIMITS.max_lag_share * duration_s:
+        raise DataError(
+            f"The command lag of {mapping.command_lag_s:g} s exceeds {MAPPING_LIMITS.max_lag_share:.0%} of the "
+            f"recording ({duration_s:.3g} s); import a longer recording, or change it with --command-lag (0: no shift)."
+        )
     requested, sent = (
         np.column_stack([held_at(t_s, column, -mapping.command_lag_s) for column in table.T])
         for table in (requested, sent)

@@ -1,0 +1,42 @@
+"""Declarations of a mapping that would replace or confuse data are refused in one sentence with the remedy."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.core.errors import ConfigError, DataError
+from carlab.recording.column_mapping import CANONICAL
+from carlab.recording.csv.foreign import import_csv
+
+_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
+foreign = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(foreign)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Ten seconds at 30 Hz."""
+    return foreign.drive(np.arange(301) / 30.0)
+
+
+@pytest.mark.parametrize("option", ["command_lag", "velocity_lag"])
+@pytest.mark.parametrize("lag_s", [50.0, -5.0, 1e9, 1e300, float("inf"), float("nan")])
+def test_lag_in_milliseconds_is_refused(option, lag_s):
+    with pytest.raises(ConfigError, match=rf"{option} is .* at most 1 s; give it in seconds"):
+        replace(CANONICAL, **{f"{option}_s": lag_s})
+
+
+@pytest.mark.parametrize(("rows", "is_refused"), [(301, False), (291, True)])
+def test_command_lag_is_at_most_a_tenth_of_the_recording(drive, tmp_path, rows, is_refused):
+    path = foreign.write(tmp_path / "run.csv", {name: column[:rows] for name, column in drive.items()})
+    mapping = CANONICAL.with_options(command_lag_s=0.99)
+    if is_refused:
+        with pytest.raises(DataError, match=r"lag of 0.99 s exceeds 10% of the recording \(9.67 s\).*--command-lag"):
+            import_csv(path, mapping=mapping)
+        return
+    sent = import_csv(path, mapping=mapping).episode.sent
+    # The command of 0.99 s later is that of the 29th row after, which is held until the 30th.
+    np.testing.assert_array_equal(sent[: rows - 30, 0], drive["steering"][29 : rows - 1])
