@@ -86,7 +86,8 @@ class ColumnMapping:
     """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``.
 
     Raises:
-        ConfigError: an unknown channel or unit, or a scale, rate or lag that is out of range.
+        ConfigError: an unknown channel or unit, a scale, rate or lag that is out of range, or one column for two
+            channels.
     """
 
     columns: Mapping[str, ColumnSource]
@@ -134,7 +135,24 @@ class ColumnMapping:
         _check_lag("command_lag", self.command_lag_s)
         for channel, source in self.columns.items():
             source.factor(channel)
+        self._check_distinct_columns()
         check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
+
+    def _check_distinct_columns(self) -> None:
+        """Raise ConfigError if two channels, or a channel and the throttle gate, have the same column."""
+        channels: dict[str, str] = {}
+        for channel, source in self.columns.items():
+            if source.name in channels:
+                raise ConfigError(
+                    f"Mapping '{self.layout}' takes {channels[source.name]} and {channel} from the same column "
+                    f"'{source.name}'; correct one of them."
+                )
+            channels[source.name] = channel
+        if self.throttle_gate in channels:
+            raise ConfigError(
+                f"Mapping '{self.layout}' takes {channels[self.throttle_gate]} and throttle_gate from the same column "
+                f"'{self.throttle_gate}'; correct one of them."
+            )
 
     def with_options(self, *, columns: Mapping[str, Mapping[str, Any]] | None = None, **options: Any) -> ColumnMapping:
         """Return a copy with other options; ``columns={"steering": {"sign": -1}}`` changes parts of a source.

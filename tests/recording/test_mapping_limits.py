@@ -40,3 +40,21 @@ def test_command_lag_is_at_most_a_tenth_of_the_recording(drive, tmp_path, rows, 
     sent = import_csv(path, mapping=mapping).episode.sent
     # The command of 0.99 s later is that of the 29th row after, which is held until the 30th.
     np.testing.assert_array_equal(sent[: rows - 30, 0], drive["steering"][29 : rows - 1])
+
+
+@pytest.mark.parametrize(("channel", "column"), [("y", "x"), ("throttle", "steering")])
+def test_one_column_for_two_channels_is_refused(channel, column):
+    with pytest.raises(ConfigError, match=rf"takes {column} and {channel} from the same column '{column}'"):
+        CANONICAL.with_options(columns={channel: {"name": column}})
+
+
+def test_channels_may_exchange_their_columns(drive, tmp_path):
+    path = foreign.write(tmp_path / "run.csv", {**drive, "x": drive["y"], "y": drive["x"]})
+    exchanged = CANONICAL.with_options(columns={"x": {"name": "y"}, "y": {"name": "x"}})
+    states = import_csv(path, mapping=exchanged).episode.states
+    np.testing.assert_array_equal(states[:, :2], np.column_stack([drive["x"], drive["y"]]))
+
+
+def test_channel_as_throttle_gate_is_refused():
+    with pytest.raises(ConfigError, match="takes throttle and throttle_gate from the same column 'throttle'"):
+        CANONICAL.with_options(throttle_gate="throttle")
