@@ -46,6 +46,8 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 class MappingSettings:
     """Limits of what a mapping may declare, each with unit and reason."""
 
+    min_period_s: float = 1e-5
+    """[s] No sensor of a car samples faster than 100 kHz. Stamps that are closer have another unit (hours, days)."""
     max_lag_s: float = 1.0
     """[s] A declared lag of velocities or commands is at most this long; longer ones are in milliseconds. The slowest
     known logger lags 0.1 s behind."""
@@ -86,8 +88,8 @@ class ColumnMapping:
     """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``.
 
     Raises:
-        ConfigError: an unknown channel or unit, a scale, rate or lag that is out of range, or one column for two
-            channels.
+        ConfigError: an unknown channel or unit, a scale, rate or lag that is out of range, one column for two
+            channels, a reference that is no channel, or ``swap_xy`` without a pose.
     """
 
     columns: Mapping[str, ColumnSource]
@@ -129,13 +131,24 @@ class ColumnMapping:
 
     def __post_init__(self) -> None:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
-        if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
-            raise ConfigError(f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero.")
+        max_rate_hz = 1.0 / MAPPING_LIMITS.min_period_s
+        if self.rate_hz is not None and not 0.0 < self.rate_hz <= max_rate_hz:
+            raise ConfigError(
+                f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero, at most {max_rate_hz:g}."
+            )
+        if self.swap_xy and self.dead_reckoning:
+            raise ConfigError(f"Mapping '{self.layout}' has no x and y to exchange (no pose); remove swap_xy.")
         _check_lag("velocity_lag", self.velocity_lag_s)
         _check_lag("command_lag", self.command_lag_s)
         for channel, source in self.columns.items():
             source.factor(channel)
         self._check_distinct_columns()
+        for name, channel in self.references.items():
+            if not isinstance(channel, str):
+                raise ConfigError(
+                    f"The reference '{name}' of mapping '{self.layout}' is {channel!r}; name the channel that the "
+                    'column measures, for example "vx".'
+                )
         check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
 
     def _check_distinct_columns(self) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from carlab.core.errors import ConfigError, DataError
-from carlab.recording.column_mapping import CANONICAL
+from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD, load_mapping
 from carlab.recording.csv.foreign import import_csv
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
@@ -58,3 +58,47 @@ def test_channels_may_exchange_their_columns(drive, tmp_path):
 def test_channel_as_throttle_gate_is_refused():
     with pytest.raises(ConfigError, match="takes throttle and throttle_gate from the same column 'throttle'"):
         CANONICAL.with_options(throttle_gate="throttle")
+
+
+def test_text_in_the_throttle_gate_is_refused_with_its_row(drive, tmp_path):
+    gate = np.ones(len(drive["t"])).astype(object)
+    gate[4] = "on"
+    path = foreign.write(tmp_path / "run.csv", {**drive, "gate": gate})
+    with pytest.raises(DataError, match=r"Row 5 of column 'gate' in run.csv holds 'on'"):
+        import_csv(path, mapping=CANONICAL.with_options(throttle_gate="gate"))
+
+
+def test_axes_cannot_be_exchanged_without_a_pose():
+    with pytest.raises(ConfigError, match=r"'dart on-board' has no x and y to exchange .*remove swap_xy"):
+        DART_ONBOARD.with_options(swap_xy=True)
+
+
+def test_clock_cannot_be_rebuilt_without_a_pose(tmp_path):
+    t_s = np.arange(301) / 30.0
+    named = foreign.drive(t_s)
+    columns = {source.name: named[channel] for channel, source in DART_ONBOARD.columns.items()}
+    path = foreign.write(tmp_path / "run.csv", {**columns, "vy": named["vy"], "safety_value": np.ones(301)})
+    mapping = DART_ONBOARD.with_options(columns={"vy": {"name": "vy"}}, clock="velocity")
+    with pytest.raises(DataError, match="cannot be rebuilt without x, y, vx and vy columns; use --clock column"):
+        import_csv(path, mapping=mapping)
+
+
+def test_reference_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "map.toml"
+    path.write_text('references = {encoder = 5}\n[columns]\nt = "t"\n')
+    with pytest.raises(ConfigError, match=r"The reference 'encoder' of mapping .* is 5; name the channel"):
+        load_mapping(path)
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e-300, 1.0 / 86_400.0])
+def test_stamps_that_are_closer_than_any_samples_are_refused(drive, tmp_path, factor):
+    """The last factor gives days."""
+    path = foreign.write(tmp_path / "run.csv", {**drive, "t": drive["t"] * factor})
+    with pytest.raises(DataError, match=r"Column 't': rows are .* s apart.*--t-unit, or convert"):
+        import_csv(path)
+
+
+@pytest.mark.parametrize("rate_hz", [1e300, float("inf"), float("nan"), 0.0])
+def test_rate_that_no_sensor_has_is_refused(rate_hz):
+    with pytest.raises(ConfigError, match=r"give a number above zero, at most 100000\."):
+        replace(CANONICAL, rate_hz=rate_hz)

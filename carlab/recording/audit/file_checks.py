@@ -10,7 +10,14 @@ import numpy as np
 from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.report import Finding, Severity
-from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, UNITS, VELOCITY_CHANNELS, ColumnMapping
+from carlab.recording.column_mapping import (
+    COMMAND_CHANNELS,
+    MAPPING_LIMITS,
+    POSE_CHANNELS,
+    UNITS,
+    VELOCITY_CHANNELS,
+    ColumnMapping,
+)
 from carlab.recording.faults.pose import frozen_rows, stale_rows
 from carlab.recording.faults.robust import LAGS_S, correlation, fit_column
 from carlab.recording.faults.stamps import gap_rows
@@ -108,9 +115,18 @@ def check_stamps(t_s: FloatArray, mapping: ColumnMapping) -> list[Finding]:
 
 
 def _check_time_unit(t_s: FloatArray, mapping: ColumnMapping) -> Finding | None:
-    """Stamps that are too far apart to control a car; an error if another unit is plausible and none is declared."""
+    """Stamps that are too close for a sensor, or too far apart to control a car.
+
+    Too close is an error; too far is one if another unit is plausible and none is declared.
+    """
     source = mapping.columns.get("t")
     median_s = float(np.median(np.diff(t_s)))
+    if source is not None and median_s < MAPPING_LIMITS.min_period_s:
+        sentence = (
+            f"Column '{source.name}': rows are {median_s:.4g} s apart, closer than the samples of any sensor; correct "
+            "the unit with --t-unit, or convert the column to seconds."
+        )
+        return Finding("wrong_unit", "t", Severity.ERROR, sentence, evidence={"median_s": median_s})
     if source is None or median_s <= MAX_PERIOD_S:
         return None
     if source.unit is not None:

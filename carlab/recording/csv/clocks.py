@@ -22,10 +22,10 @@ def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
     """Stamps (N,) [s] from distance over speed, with the median period below 0.3 m/s, and a note about them.
 
     Raises:
-        DataError: there are no vx and vy columns, or the car hardly moves.
+        DataError: there are no x, y, vx and vy columns, or the car hardly moves.
     """
-    if "vx" not in channels.values or "vy" not in channels.values:
-        raise DataError("The clock cannot be rebuilt without vx and vy columns; use --clock column.")
+    if any(name not in channels.values for name in ("x", "y", "vx", "vy")):
+        raise DataError("The clock cannot be rebuilt without x, y, vx and vy columns; use --clock column.")
     periods_s = channels.periods_s()
     median_s = float(np.nanmedian(periods_s)) if np.isfinite(periods_s).any() else float("nan")
     # A period outside 0.5 to 3 medians is due to a wrong speed (an impact, a stale row), not to the clock.

@@ -137,7 +137,7 @@ def _usable_rows(
     source = table.path.name
     findings = _text_column_findings(table, mapping)
     values, extra = _converted_columns(table, mapping)
-    gate = {mapping.throttle_gate: extra[mapping.throttle_gate]} if mapping.throttle_gate in extra else {}
+    gate = {mapping.throttle_gate: table.column(mapping.throttle_gate)} if mapping.throttle_gate else {}
     new_findings, is_complete = check_missing({**values, **gate}, mapping)
     findings += new_findings
     raise_errors(source, findings)
