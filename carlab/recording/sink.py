@@ -67,6 +67,11 @@ def describe_os_error(error: OSError, path: Path | str) -> str:
         return f"{path} could not be written because {why}; {space} and start again."
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{path} may not be written; check the permissions of its folder or choose another folder."
+    if isinstance(error, FileExistsError) and str(error.filename).endswith(PARTIAL_SUFFIX):
+        return (
+            f"{error.filename} exists: another command writes it, or one was interrupted; move or remove this file if "
+            "no command writes it, or choose another name."
+        )
     if isinstance(error, FileExistsError):
         return f"{path} exists and recordings are never overwritten; choose another name."
     if isinstance(error, NotADirectoryError):

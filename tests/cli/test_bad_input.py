@@ -237,6 +237,24 @@ def test_import_does_not_overwrite_a_recording(carlab: Carlab, tmp_path: Path) -
     assert out.read_bytes() == before
 
 
+def test_unfinished_recording_is_named_by_import_and_view(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    unfinished = tmp_path / "drive.mcap.partial"
+    assert carlab("import", write(path, data), "--out", tmp_path / "complete.mcap")[0] == 0
+    content = (tmp_path / "complete.mcap").read_bytes()
+    unfinished.write_bytes(content[: len(content) // 2])
+    code, text = carlab("import", path)
+    assert code == 1
+    assert f"{unfinished} exists: another command writes it, or one was interrupted; move or remove" in text
+    assert unfinished.stat().st_size == len(content) // 2
+    for options in (("view",), ("replay",), ("export", "--out", tmp_path / "table.csv")):
+        code, text = carlab(*options, tmp_path / "drive.mcap")
+        assert code == 2
+        assert f"was never finished; name '{unfinished}'" in text
+    code, text = carlab("export", unfinished, "--out", tmp_path / "drive_again.csv")
+    assert code == 0, text
+
+
 def test_closed_pipe_ends_the_program_without_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = os.pipe()
     os.close(reader)
