@@ -16,7 +16,7 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.recording.episode_builder import LATE, POLICY_TIME, POSE_AGE, goal_of, outlines_of, polygon_of
 from carlab.recording.rerun.screenshot import save_screenshot as save_screenshot
-from carlab.recording.sink import describe_os_error
+from carlab.recording.sink import describe_os_error, make_folder
 
 CAR_LENGTH_M = 0.42
 CAR_WIDTH_M = 0.19
@@ -35,7 +35,7 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
 
     Args:
         episodes: at least one episode.
-        path: the picture; its suffix (.png, .svg, .pdf) selects the format. Overwritten.
+        path: the picture; its suffix (.png, .svg, .pdf) selects the format. Overwritten; its folder is created.
         title: title of the picture; by default policy, car and reality of the first episode.
 
     Raises:
@@ -65,6 +65,7 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
     _draw_latencies_or_rewards(axes[3], episodes)
     _finish_axes(plan, axes)
     try:
+        make_folder(Path(path).parent)
         figure.savefig(Path(path), dpi=130)
     except OSError as error:
         raise DataError(describe_os_error(error, path)) from error

@@ -76,6 +76,10 @@ def describe_os_error(error: OSError, path: Path | str) -> str:
         return f"{path} exists and recordings are never overwritten; choose another name."
     if isinstance(error, NotADirectoryError):
         return f"{path} cannot be created because a file has the path of its folder; choose another folder."
+    if isinstance(error, FileNotFoundError):
+        return (
+            f"{path} could not be written because its folder does not exist; create the folder or choose another one."
+        )
     return f"{path} could not be written: {error.strerror or error}; check the disk, then start again."
 
 

@@ -11,7 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from matplotlib.image import imread
 
+from carlab.api.recordings import Recording
 from carlab.core.errors import DataError
+from carlab.recording.atomic_files import write_text
 from carlab.recording.csv.export import table_of, write_csv, write_parquet
 from carlab.recording.episode_builder import episode_from_documents, goal_of, polygon_of
 from carlab.recording.picture import outline, save_summary
@@ -56,15 +58,21 @@ def test_picture_of_several_episodes_accepts_missing_data(tmp_path, episode, cou
     save_summary([incomplete], tmp_path / "odd.png")
 
 
+@pytest.mark.parametrize("name", ["x.png", "x.csv", "x.csv.gz", "x.parquet", "x.mcap", "x.rrd"])
+def test_saved_recording_gets_its_folder(tmp_path, episode, name):
+    path = Recording(tmp_path / "0001.mcap", (episode,)).save(tmp_path / "new" / "folder" / name)
+    assert path.stat().st_size > 100
+
+
 def test_picture_or_table_that_cannot_be_written_is_reported(tmp_path, episode):
     with pytest.raises(DataError, match="no episode"):
         save_summary([], tmp_path / "x.png")
     with pytest.raises(DataError, match=r"use \.png"):
         save_summary([episode], tmp_path / "x.docx")
-    with pytest.raises(DataError, match="could not be written"):
-        save_summary([episode], tmp_path / "nowhere" / "x.png")
+    with pytest.raises(DataError, match="its folder does not exist; create the folder or choose another one"):
+        write_text(tmp_path / "nowhere" / "x.json", "{}")
     (tmp_path / "file").touch()
-    for write in (write_csv, write_parquet):
+    for write in (write_csv, write_parquet, lambda episode, path: save_summary([episode], path.with_suffix(".png"))):
         with pytest.raises(DataError, match="a file has the path of its folder"):
             write(episode, tmp_path / "file" / "x")
 
