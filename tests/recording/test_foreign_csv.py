@@ -263,12 +263,17 @@ class TestRefusal:
     def test_infinity_is_refused(self, clean, tmp_path):
         throttle = clean["throttle"].copy()
         throttle[7] = np.inf
-        self.refuse(tmp_path, {**clean, "throttle": throttle}, "'throttle'", "row 8")
+        self.refuse(tmp_path, {**clean, "throttle": throttle}, "'throttle'", "the first is inf in row 8")
 
-    def test_implausible_number_is_refused(self, clean, tmp_path):
+    def test_implausible_number_is_refused_with_its_value_in_the_file(self, clean, tmp_path):
         vx = clean["vx"].copy()
-        vx[20] = 1e300
-        self.refuse(tmp_path, {**clean, "vx": vx}, "'vx'", "row 21")
+        vx[[20, 40]] = 1e30, -1e300
+        mapping = CANONICAL.with_options(columns={"vx": {"unit": "km/h"}})
+        self.refuse(tmp_path, {**clean, "vx": vx}, "'vx'", "2 of 900 rows", "1e+30 in row 21", mapping=mapping)
+        self.refuse(tmp_path, {**clean, "vx": np.full(900, 1e30)}, "no plausible number", "1e+30", "remove it")
+        vx[60] = np.nan
+        with pytest.raises(DataError, match=r"(?s)2 faults.*no number in 1 of 900 rows.*row 61.*1e\+30 in row 21"):
+            import_csv(foreign.write(tmp_path / "run.csv", {**clean, "vx": vx}))
 
     def test_missing_last_command_is_accepted(self, clean, tmp_path):
         steering = clean["steering"].copy()
@@ -343,6 +348,8 @@ class TestRefusal:
             (b"0,1,2,3,4,5\n1,1,1,1,1,1\n2,2,2,2,2,2\n", "header line"),
             (b"t,x,y,yaw,steering,throttle\n0,0,0,0,0,0\n1,1,1\n2,2,2,2,2,2\n", "Row 2"),
             (b"t,t,y,yaw,steering,throttle\n0,0,0,0,0,0\n1,1,1,1,1,1\n", "two columns named 't'"),
+            (b"t|x|y\n0|0|0\n1|1|1\n", r"single column, 't\|x\|y'; separate the columns by commas"),
+            (b"t x y\n0 0 0\n1 1 1\n", "single column, 't x y'; separate the columns by commas"),
             (b"\x89PNG\r\n\x1a\n\xff\xd8", "not a text file"),
             (gzip.compress(b"t,x,y\n" * 1000, mtime=0)[:-20], "not a complete gzip file"),
         ],

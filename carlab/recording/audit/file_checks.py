@@ -43,35 +43,52 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
     ``values`` are the columns (N,) by channel.
     Commands of the last row are not executed, so they may be missing.
     """
-    rows = len(values["t"])
-    whole = np.ones(rows, dtype=bool)
+    whole = np.ones(len(values["t"]), dtype=bool)
     findings = []
-    is_dropped = mapping.missing == "drop"
+    for channel, column in values.items():
+        is_missing = np.isnan(column)
+        is_too_large = np.abs(column) > (MAX_STAMP if channel == "t" else MAX_NUMBER)
+        for bad in (is_missing, is_too_large):
+            bad[-1] &= channel not in COMMAND_CHANNELS
+        whole &= ~(is_missing | is_too_large)
+        findings += _cell_findings(channel, column, is_missing, is_too_large, mapping)
+    return findings, whole
+
+
+def _cell_findings(
+    channel: str, column: FloatArray, is_missing: BoolArray, is_too_large: BoolArray, mapping: ColumnMapping
+) -> list[Finding]:
+    """Findings about missing and too large cells of one column; the masks and the column are (N,)."""
+    source = mapping.columns.get(channel)
+    name = channel if source is None else source.name
+    n_rows, bad = len(column), is_missing | is_too_large
+    example = ""
+    if is_too_large.any():
+        row = int(np.argmax(is_too_large))
+        offset_rad = mapping.yaw_offset_rad if channel == "yaw" else 0.0
+        cell = (column[row] - offset_rad) / (1.0 if source is None else source.factor(channel))
+        example = f"{cell:.4g} in row {row + 1}"
+    if bad.all():
+        remedy = "remove it from the file" if channel in VELOCITY_CHANNELS else "repair the file"
+        what = f"has no plausible number in any row ({example})" if example else "has no number in any row"
+        sentence = f"Column '{name}' {what}; {remedy}."
+        return [Finding.at(bad, "not_a_number", channel, Severity.ERROR, sentence, {"share": 1.0})]
     severity, treatment, option = (
         (Severity.REPAIRED, "those rows were left out and the command before each was held", None)
-        if is_dropped
+        if mapping.missing == "drop"
         else (Severity.ERROR, "leave those rows out with --missing drop, or repair the file", "--missing drop")
     )
-    for channel, column in values.items():
-        bad = ~np.isfinite(column) | (np.abs(column) > (MAX_STAMP if channel == "t" else MAX_NUMBER))
-        bad[-1] &= channel not in COMMAND_CHANNELS
-        if not bad.any():
-            continue
-        whole &= ~bad
-        name = mapping.columns[channel].name if channel in mapping.columns else channel
-        if bad.all():
-            remedy = "remove it from the file" if channel in VELOCITY_CHANNELS else "repair the file"
-            sentence = f"Column '{name}' has no number in any row; {remedy}."
-            findings.append(Finding.at(bad, "not_a_number", channel, Severity.ERROR, sentence, {"share": 1.0}))
-            continue
-        sentence = (
-            f"Column '{name}' has no number in {bad.sum()} of {rows} rows, the first in row {np.argmax(bad) + 1}; "
-            f"{treatment}."
-        )
-        findings.append(
-            Finding.at(bad, "not_a_number", channel, severity, sentence, {"share": float(np.mean(bad))}, option)
-        )
-    return findings, whole
+    sentences = {
+        f"Column '{name}' has no number in {is_missing.sum()} of {n_rows} rows, the first in row "
+        f"{np.argmax(is_missing) + 1}; {treatment}.": is_missing,
+        f"Column '{name}' has too large numbers in {is_too_large.sum()} of {n_rows} rows, the first is {example}; "
+        f"{treatment}.": is_too_large,
+    }
+    return [
+        Finding.at(rows, "not_a_number", channel, severity, sentence, {"share": float(np.mean(rows))}, option)
+        for sentence, rows in sentences.items()
+        if rows.any()
+    ]
 
 
 def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:

@@ -59,7 +59,7 @@ def read_csv(path: Path | str) -> CsvTable:
     Lines before the header that begin with ``#`` are skipped. The header may begin with ``#``, as numpy.savetxt writes.
     Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Numbers have a decimal point, or all have a decimal
     comma; where that is ambiguous, their columns are texts. Raises DataError if the file is missing, empty,
-    truncated or not text, or if a row has another number of cells than the header.
+    truncated or not text, if it has a single column, or if a row has another number of cells than the header.
     """
     path = Path(path)
     text = _without_comments(_read_text(path))
@@ -74,6 +74,11 @@ def read_csv(path: Path | str) -> CsvTable:
     header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
     if all(_is_number(cell) or has_decimal_comma(cell) for cell in header):
         raise DataError(f"{path.name} begins with numbers; add a header line with the column names.")
+    if len(header) == 1:
+        raise DataError(
+            f"{path.name} has a single column, {_shortened(header[0])!r}; separate the columns by commas, semicolons "
+            "or tabs."
+        )
     duplicates = sorted({name for name in header if header.count(name) > 1})
     if duplicates:
         raise DataError(f"{path.name} has two columns named '{duplicates[0]}'; rename one in the header.")
@@ -98,6 +103,11 @@ def read_csv(path: Path | str) -> CsvTable:
     columns |= {name: np.array(column, dtype=np.float64) for name, column in converted.items()}
     first_texts = {name: _first_text(column) for name, column in texts.items() if name not in converted}
     return CsvTable(path, header, columns, first_texts, bool(converted))
+
+
+def _shortened(text: str) -> str:
+    """A text of at most 80 characters."""
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _numbers(cells: list[str]) -> FloatArray | None:
