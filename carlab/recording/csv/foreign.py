@@ -31,6 +31,9 @@ from carlab.recording.faults.robust import held_at
 from carlab.recording.faults.stamps import gap_rows, segments
 from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
+SEGMENT = "segment"
+"""Extra column of an episode with the numbers of the parts between gaps and jumps."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImportedRecording:
@@ -251,9 +254,7 @@ def _episodes(
 ) -> tuple[tuple[EpisodeData, ...], list[Finding]]:
     requested, sent, findings = _commands(t_s, channels, mapping)
     parts, row_findings = _episode_rows(channels.segment, mapping)
-    extra = dict(channels.extra)
-    if mapping.gaps != "split" and np.ptp(channels.segment) > 0:
-        extra["segment"] = channels.segment
+    extra, extra_findings = _extra_columns(channels, mapping)
     episodes = []
     for part in parts:
         times = t_s[part]
@@ -271,7 +272,29 @@ def _episodes(
                 extra={name: column[part] for name, column in extra.items()},
             )
         )
-    return tuple(episodes), findings + row_findings
+    return tuple(episodes), findings + row_findings + extra_findings
+
+
+def _extra_columns(channels: Channels, mapping: ColumnMapping) -> tuple[dict[str, FloatArray], list[Finding]]:
+    """Extra columns by name, each (N,), with ``segment`` if an episode has several parts.
+
+    Readers of episodes do not join rows of different ``segment``, so a column of the file with this name gets another.
+    """
+    extra = dict(channels.extra)
+    findings = []
+    if SEGMENT in extra and not np.array_equal(extra[SEGMENT], channels.segment):
+        name = f"{SEGMENT}_of_file"
+        while name in extra:
+            name += "_"
+        extra[name] = extra.pop(SEGMENT)
+        sentence = (
+            f"Column '{SEGMENT}' is kept as '{name}': in a recording, '{SEGMENT}' numbers the parts between gaps and "
+            "jumps."
+        )
+        findings.append(Finding("renamed_column", SEGMENT, Severity.INFO, sentence))
+    if mapping.gaps != "split" and np.ptp(channels.segment) > 0:
+        extra[SEGMENT] = channels.segment
+    return extra, findings
 
 
 def _commands(
