@@ -137,8 +137,7 @@ def _read_item(item: RecordingLike, role: str, latency_s: float, loaded: LoadedR
         read = item if isinstance(item, Recording) else load(path)
         loaded.episodes += [align_states(episode, latency_s) for episode in read.episodes]
         if read.is_recovered:
-            ticks = read.episode.ticks
-            loaded.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
+            loaded.notes.append(f"{path} {read.recovery}.")
     return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
 
 

@@ -27,6 +27,7 @@ class Recording:
         audit: findings in a CSV; None for MCAP.
         mapping: the column mapping of a CSV; None if its layout was recognised.
         is_recovered: whether the MCAP file is incomplete and its complete ticks were recovered.
+        recovery: predicate about an incomplete file: what is wrong, how many ticks were recovered, and the remedy.
     """
 
     path: Path
@@ -35,6 +36,7 @@ class Recording:
     audit: AuditReport | None = None
     mapping: ColumnMapping | None = None
     is_recovered: bool = False
+    recovery: str = ""
 
     @property
     def episode(self) -> EpisodeData:
@@ -136,7 +138,8 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
     from carlab.recording.mcap.source import read_episode
 
     episode = read_episode(path)
-    return Recording(path, (episode,), is_recovered=bool(episode.metadata.get("recovered")))
+    recovery = episode.metadata.get("recovery", "")
+    return Recording(path, (episode,), is_recovered=bool(recovery), recovery=recovery)
 
 
 def required_file(path: Path, what: str = "The recording") -> Path:

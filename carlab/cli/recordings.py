@@ -31,8 +31,7 @@ def print_recording(recording: Recording) -> Recording:
         console.print(recording.announcement)
         print_findings(recording.audit)
     if recording.is_recovered:
-        ticks = recording.episode.ticks
-        console.print(f"{recording.path} was never finished; {ticks} complete ticks were recovered.", style="yellow")
+        console.print(f"{recording.path} {recording.recovery}.", style="yellow")
     return recording
 
 

@@ -78,7 +78,7 @@ def _observed(
     rows = [(tick.t_s, tick.step, tick.observation) for tick in ticks]
     if ended is None or ended.last is None or not ticks or ended.steps <= ticks[-1].step:
         return ticks[:-1], rows
-    arrival = transitions.get(ticks[-1].step)
+    arrival = transitions.get(ended.steps - 1)
     return ticks, [*rows, (ended.t_s if arrival is None else arrival.t_s, ended.steps, ended.last)]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from carlab import cli
 from carlab.cars.emulated_world import World, WorldConfig
@@ -214,7 +215,8 @@ def test_truncated_mcap_is_recovered_and_mcap_without_ticks_is_refused(carlab: C
     truncated.write_bytes(complete.read_bytes()[: complete.stat().st_size // 2])
     code, text = carlab("export", truncated, "--out", tmp_path / "cut.csv")
     assert code == 0
-    assert "recovered" in text
+    assert "truncated.mcap ends at byte" in text
+    assert "complete ticks were recovered; copy it again." in text
     rows = np.genfromtxt(tmp_path / "cut.csv", delimiter=",", names=True)
     assert 20 < len(rows) < len(data)
     np.testing.assert_allclose(rows["x"], data[: len(rows), 1], atol=1e-12)
@@ -235,6 +237,23 @@ def test_import_does_not_overwrite_a_recording(carlab: Carlab, tmp_path: Path) -
     assert code == 1
     assert "already" in text
     assert out.read_bytes() == before
+
+
+def test_damaged_byte_of_a_recording_is_named(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    recording = tmp_path / "drive.mcap"
+    assert carlab("import", write(path, data), "--out", recording)[0] == 0
+    with recording.open("r+b") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[2]
+        file.seek(chunk.chunk_start_offset + chunk.chunk_length - 10)
+        file.write(b"damage")
+    code, text = carlab("export", recording, "--out", tmp_path / "table.csv")
+    assert code == 0
+    rows = np.genfromtxt(tmp_path / "table.csv", delimiter=",", names=True)
+    assert f"{len(rows) - 1} of {len(data) - 1} ticks were recovered; copy it again." in text
+    assert f"drive.mcap is damaged at byte {chunk.chunk_start_offset};" in text
+    assert 0.7 * len(data) < len(rows) < len(data)
+    assert rows["x"][-1] == data[-1, 1]
 
 
 def test_unfinished_recording_is_named_by_import_and_view(carlab: Carlab, tmp_path: Path) -> None:

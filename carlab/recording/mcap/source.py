@@ -1,4 +1,4 @@
-"""Reader of recordings, complete or not: it returns all records before the first damaged byte."""
+"""Reader of recordings, complete or not: it returns all records that are not damaged."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from mcap.records import Attachment, Channel, Header, Message, Metadata
-from mcap.stream_reader import StreamReader
 
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick
 from carlab.core.episode_data import EpisodeData
@@ -19,9 +18,8 @@ from carlab.core.quantities import Action, Observation, PoseSample
 from carlab.recording.episode_builder import episode_from_documents
 from carlab.recording.mcap import messages as messages
 from carlab.recording.mcap import schemas as schemas
+from carlab.recording.mcap.damage import MAGIC, NEVER_FINISHED, FileDefect, read_records
 from carlab.recording.sink import LogLine, partial_path
-
-MAGIC = b"\x89MCAP0\r\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,22 +27,29 @@ class Recording:
     """Contents of one recording.
 
     ``documents`` are the emitted documents in order; without an EpisodeEnded if the writer was killed.
-    ``recovered`` is True if the file is incomplete; ``extra`` has the further columns of an imported recording.
+    ``defect`` is what is wrong with the file, None if it is complete; ``extra`` has the further columns of an imported
+    recording.
     """
 
     path: Path
     documents: tuple[Document, ...]
     run_metadata: Mapping[str, str]
     log: tuple[LogLine, ...]
-    recovered: bool
+    defect: FileDefect | None
     extra: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
+
+    @property
+    def recovered(self) -> bool:
+        """Whether the file is incomplete."""
+        return self.defect is not None
 
 
 def read_episode(path: Path | str) -> EpisodeData:
     """Read a recording as arrays; times are on the car's clock.
 
-    An incomplete file gives its complete ticks, with ``recovered`` = ``true`` and ``end_reason`` = ``CRASHED`` in the
-    metadata. Metadata of the run, of the episode and of its end are one flat mapping.
+    An incomplete file gives its complete ticks, with ``recovered`` = ``true`` and a sentence ``recovery`` in the
+    metadata; ``end_reason`` is ``CRASHED`` if the end is missing. The ticks of a damaged chunk are left out. Metadata
+    of the run, of the episode and of its end are one flat mapping.
 
     Raises:
         DataError: The file is not a carlab recording, or holds no complete tick.
@@ -53,10 +58,13 @@ def read_episode(path: Path | str) -> EpisodeData:
     try:
         episode = episode_from_documents(recording.documents, recording.extra, recording.run_metadata)
     except DataError as error:
+        if recording.defect not in (None, NEVER_FINISHED):
+            raise DataError(_no_tick(recording.path, recording.defect)) from error
         raise DataError(str(error).replace("The recording", str(recording.path), 1)) from error
-    if recording.recovered:
-        return dataclasses.replace(episode, metadata={**episode.metadata, "recovered": "true"})
-    return episode
+    if recording.defect is None:
+        return episode
+    recovery = {"recovered": "true", "recovery": recording.defect.sentence(episode.ticks)}
+    return dataclasses.replace(episode, metadata={**episode.metadata, **recovery})
 
 
 def read_documents(path: Path | str) -> tuple[Document, ...]:
@@ -68,31 +76,19 @@ def read_recording(path: Path | str) -> Recording:
     """Read a recording. Raises DataError if it is no recording, or ends before its episode starts."""
     path = Path(path)
     collector = _Collector()
-    complete = False
     try:
         with path.open("rb") as file:
             head = file.read(len(MAGIC))
             if head != MAGIC and (head != MAGIC[: len(head)] or not head):
                 raise DataError(_not_an_mcap(path, head))
-            file.seek(0)
-            size = path.stat().st_size
-            try:
-                for record in StreamReader(file, validate_crcs=True, record_size_limit=size).records:
-                    collector.take(record)
-                complete = True
-            except OSError:
-                raise
-            except Exception:
-                # Truncated or damaged: mcap, zstandard and protobuf raise different errors. The chunks before are valid
-                # (they have checksums); `recovered` informs the caller.
-                complete = False
+            defect = read_records(file, collector.take, collector.skip)
     except FileNotFoundError as error:
         raise DataError(_missing(path)) from error
     except IsADirectoryError as error:
         raise DataError(f"{path} is a folder; name one of the .mcap files in it (episodes/0001.mcap).") from error
     except OSError as error:
         raise DataError(f"{path} could not be read: {error.strerror}; check its permissions.") from error
-    return collector.recording(path, complete)
+    return collector.recording(path, defect)
 
 
 def _not_an_mcap(path: Path, head: bytes) -> str:
@@ -100,6 +96,13 @@ def _not_an_mcap(path: Path, head: bytes) -> str:
         return f"{path} is for the rerun viewer (carlab view); name the .mcap recording instead."
     found = f"it begins with {str(head)[1:]}" if head else "it is empty"
     return f"{path} is not an MCAP file ({found}); name an .mcap recording, or read a table with carlab import."
+
+
+def _no_tick(path: Path, defect: FileDefect | None) -> str:
+    """Sentence about a recording that ends before its first tick."""
+    if defect in (None, NEVER_FINISHED):
+        return f"{path} holds no complete tick (its writer was stopped before the episode began); record it again."
+    return f"{path} holds no complete tick and {defect.clause}; {defect.remedy}."
 
 
 def _short(error: Exception) -> str:
@@ -155,6 +158,12 @@ class _Collector:
             case Header():
                 self._library = record.library
 
+    def skip(self) -> None:
+        """Forget the parts of a tick whose other parts are damaged."""
+        self._state = None
+        self._poses.clear()
+        self._actions.clear()
+
     def _handle_message(self, topic: str, data: bytes) -> None:
         if topic not in self._handlers and topic not in messages.DECODERS:
             return
@@ -183,17 +192,15 @@ class _Collector:
         )
         self._state = None
 
-    def recording(self, path: Path, complete: bool) -> Recording:
+    def recording(self, path: Path, defect: FileDefect | None) -> Recording:
         ours = self._library.startswith("carlab ")
-        if not ours and (complete or self._topics):
+        if not ours and (defect is None or self._topics):
             raise DataError(
                 f"{path} is an MCAP file but not a recording of carlab (written by "
                 f"{self._library or 'an unknown program'}); export it as CSV there and use carlab import."
             )
         if not self._episode:
-            raise DataError(
-                f"{path} holds no complete tick (its writer was stopped before the episode began); record it again."
-            )
+            raise DataError(_no_tick(path, defect))
         try:
             documents = list(self._assemble())
         except (KeyError, ValueError) as error:
@@ -201,8 +208,9 @@ class _Collector:
                 f"{path} has a record {schemas.EPISODE_RECORD} that this version cannot read ({_short(error)}); "
                 "read it with the version that wrote it."
             ) from error
-        has_end = isinstance(documents[-1], EpisodeEnded)
-        return Recording(path, tuple(documents), self._run, tuple(self._log), not (complete and has_end), self._extra)
+        if defect is None and not isinstance(documents[-1], EpisodeEnded):
+            defect = NEVER_FINISHED
+        return Recording(path, tuple(documents), self._run, tuple(self._log), defect, self._extra)
 
     def _assemble(self) -> Iterator[Document]:
         started: EpisodeStarted = messages.started_from_metadata(self._episode, self._config)
