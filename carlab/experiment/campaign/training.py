@@ -140,8 +140,7 @@ def train(
         plan, *environments, None if earlier_car is None else earlier, plan.updates_before(number), progress
     )
     figures |= {**policy_figures, "policy_seconds": clock.now_s() - began_s}
-    prediction = _prediction_environment(plan, dynamics, envelope, seed)
-    figures |= predicted_figures(plan, agent, prediction, usable, envelope, seed)
+    figures |= _predicted_figures(plan, agent, dynamics, usable, envelope, seed)
 
     def write(folder: Path) -> None:
         save_car(dynamics, folder / DYNAMICS_FILE)
@@ -196,14 +195,22 @@ def _environments(
     return training, model_env.ModelEnv(dynamics, task, N_EVALUATION_CARS, seed=seed + 1, **gate)
 
 
-def _prediction_environment(plan: TrainingPlan, dynamics: LearnedCar, envelope: SafetyEnvelope, seed: int) -> ModelEnv:
-    """The learned car with the safety gate of the driven car."""
+def _predicted_figures(
+    plan: TrainingPlan,
+    agent: SacAgent,
+    dynamics: LearnedCar,
+    episodes: list[EpisodeData],
+    envelope: SafetyEnvelope,
+    seed: int,
+) -> dict[str, Any]:
+    """``predicted_figures`` for the learned car with the safety gate of the driven car."""
     from learning.world.model_env import ModelEnv
 
     period_s = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml)).control_period_s
-    return ModelEnv(
+    learned = ModelEnv(
         dynamics, plan.task, N_EVALUATION_CARS, envelope=envelope, period_s=period_s, seed=seed + 2, device=plan.device
     )
+    return predicted_figures(plan, agent, learned, episodes, envelope, seed)
 
 
 def _trained_policy(
