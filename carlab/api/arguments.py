@@ -31,3 +31,10 @@ def at_least(minimum: int, **values: Any) -> None:
     for name, value in values.items():
         if value is not None and value < minimum:
             raise ConfigError(f"--{name.replace('_', '-')} {value}: give at least {minimum}.")
+
+
+def at_most(maximum: int, **values: Any) -> None:
+    """Raise ConfigError for an argument that is above ``maximum``; None is valid."""
+    for name, value in values.items():
+        if value is not None and value > maximum:
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: give at most {maximum}.")

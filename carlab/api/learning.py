@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
-from carlab.api.arguments import above_zero, at_least, whole_number
+from carlab.api.arguments import above_zero, at_least, at_most, whole_number
 from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
     RunHooks,
@@ -301,6 +301,7 @@ def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
 
 
 def _check(request: LearnRequest) -> None:
+    from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
     from carlab.experiment.episodes.interrupts import check_main_thread
     from learning.devices import available
 
@@ -309,6 +310,7 @@ def _check(request: LearnRequest) -> None:
     above_zero(**counts)
     whole_number(**counts)
     at_least(0, history=request.history, seed=request.seed)
+    at_most(LARGEST_GIVEN_HISTORY, history=request.history)
     above_zero(ray_wait=request.ray_wait)
     if not request.ray:
         available(request.device or "cpu")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from sim_backends.measurement import COMMAND_DELAY
 from sim_backends.registry import REGISTRY
 
 HISTORY = 8
-"""Number of past commands from which hidden states (delays, lags) of a drawn car follow."""
+"""Minimum number of past commands from which hidden states (delays, lags) of a drawn car follow."""
 MEAN_EFFECTS = 1.5
 """Mean number of unknown effects of a car."""
 MEAN_SIZE = 1.5
@@ -47,15 +47,12 @@ class DrawnCars:
     Attributes:
         config: the simulator, with the effects of all cars.
         values: numbers that replace those of ``config``, by dotted name, each (N,); an absent effect has its identity.
+        history: H, number of past commands in the features.
     """
 
     config: SimulatorConfig
     values: dict[str, Tensor]
-
-    @property
-    def history(self) -> int:
-        """Number of past commands in the features."""
-        return HISTORY
+    history: int = HISTORY
 
     def __len__(self) -> int:
         """N, the number of cars."""
@@ -63,7 +60,7 @@ class DrawnCars:
 
     def take(self, cars: Tensor) -> DrawnCars:
         """The cars with indices (M,)."""
-        return DrawnCars(self.config, {name: value[cars] for name, value in self.values.items()})
+        return replace(self, values={name: value[cars] for name, value in self.values.items()})
 
     def rollouts(self, count: int, generator: torch.Generator) -> DrawnRollouts:
         """Start rollouts of ``count`` cars, in turn."""
@@ -96,13 +93,14 @@ class DrawnRollouts:
         return None
 
 
-def draw_cars(prior: SimulatorConfig, count: int, generator: torch.Generator) -> DrawnCars:
+def draw_cars(prior: SimulatorConfig, count: int, generator: torch.Generator, history: int = HISTORY) -> DrawnCars:
     """Draw cars from the prior and from plausible effects that it does not have.
 
     Args:
         prior: simulator with ranges, standard deviations and effects.
         count: number of cars.
         generator: of all draws.
+        history: number of past commands in the features; values below ``HISTORY`` are raised to it.
     """
     model = CarModel(prior, HISTORY, known_ranges(prior))
     drawn = model.parameters(torch.randn((count, model.size), generator=generator))
@@ -119,7 +117,7 @@ def draw_cars(prior: SimulatorConfig, count: int, generator: torch.Generator) ->
         values[f"effects.{effect.id}.{effect.parameters[0].name}"] = _sizes(
             effect, count, MEAN_EFFECTS / len(unknown), values, generator
         )
-    return DrawnCars(prior, values)
+    return DrawnCars(prior, values, max(history, HISTORY))
 
 
 def _is_plausible(effect: Effect, prior: SimulatorConfig) -> bool:
@@ -154,7 +152,7 @@ def select_cars(cars: DrawnCars, episodes: Sequence[EpisodeData], count: int) ->
         episodes: recordings; without a complete window all cars are equally plausible, and the first are returned.
         count: number of cars.
     """
-    windows = _windows(episodes)
+    windows = _windows(episodes, cars.history)
     if windows is None:
         return cars.take(torch.arange(count))
     start, past, commands, end = windows
@@ -170,7 +168,7 @@ def select_cars(cars: DrawnCars, episodes: Sequence[EpisodeData], count: int) ->
     return cars.take(cost.argsort()[:count])
 
 
-def _windows(episodes: Sequence[EpisodeData]) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+def _windows(episodes: Sequence[EpisodeData], history: int) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
     """Initial states (S, 6), past commands (S, H, 2), commands (S, T, 2) and final states (S, 6) of windows.
 
     No window and no history spans a gap in time, and no window spans a jump of the poses (``segment`` of an imported
@@ -180,12 +178,12 @@ def _windows(episodes: Sequence[EpisodeData]) -> tuple[Tensor, Tensor, Tensor, T
     for episode in episodes:
         whole = whole_steps(episode)
         segment = episode.extra.get("segment", np.zeros(episode.ticks + 1))
-        for first in range(HISTORY, episode.ticks - WINDOW_TICKS + 1, WINDOW_TICKS // 2):
+        for first in range(history, episode.ticks - WINDOW_TICKS + 1, WINDOW_TICKS // 2):
             last = first + WINDOW_TICKS
-            if not whole[first - HISTORY : last].all() or np.ptp(segment[first : last + 1]) > 0:
+            if not whole[first - history : last].all() or np.ptp(segment[first : last + 1]) > 0:
                 continue
             parts = (
-                episode.states[first], episode.sent[first - HISTORY : first], episode.sent[first:last],
+                episode.states[first], episode.sent[first - history : first], episode.sent[first:last],
                 episode.states[last],
             )  # fmt: skip
             row = [torch.from_numpy(part.copy()).float() for part in parts]

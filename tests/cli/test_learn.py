@@ -74,6 +74,7 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
     [
         ("--episodes 0", "--episodes 0: give a number above zero."),
         ("--history -1", "--history -1: give at least 0."),
+        ("--history 101", "--history 101: give at most 100."),
         ("--seed -1", "--seed -1: give at least 0."),
         ("--ray local --ray-wait 0", "--ray-wait 0: give a number above zero."),
         ("--ticks 0", "--ticks 0: give a number above zero."),

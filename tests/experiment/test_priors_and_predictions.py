@@ -113,3 +113,25 @@ def test_weight_of_drawn_cars_falls_with_the_number_of_episodes(
     figures = predicted_figures(plan, agent, Cars(torch.arange(50.0, 70.0)), recordings, SafetyEnvelope(), 0)  # type: ignore[arg-type]
     assert (figures["predicted_low"], figures["predicted_return"]) == (low, median)
     assert figures["predicted_high"] == 68.0
+
+
+@pytest.mark.parametrize("history", [0, 4, 8, 9, 12])
+def test_policy_observes_its_own_past_commands_in_drawn_cars(history: int) -> None:
+    """A policy whose commands count the ticks observes state features and its newest ``history`` commands."""
+    observed: list[np.ndarray] = []
+
+    class CountingPolicy:
+        def act(self, seen: np.ndarray) -> np.ndarray:
+            observed.append(seen)
+            return np.full((len(seen), 2), 0.001 * len(observed), dtype=np.float32)
+
+    class LearnedCar:
+        def roll_out(self, act: object, max_ticks: int | None = None) -> RolloutEpisodes:
+            return RolloutEpisodes(torch.zeros(4), torch.zeros(4), torch.zeros(4, 7 + 2 * history))
+
+    plan = TrainingPlan(tomli_w.dumps(SimulatorConfig().to_tables()), history=history, ticks=history + 3)
+    predicted_figures(plan, CountingPolicy(), LearnedCar(), [recording_of(60)], SafetyEnvelope(), 0)  # type: ignore[arg-type]
+    assert [seen.shape for seen in observed] == [(64, 7 + 2 * history)] * (history + 3)
+    assert np.allclose(np.hypot(observed[-1][:, 2], observed[-1][:, 3]), 1.0, atol=1e-5), "sine and cosine of the yaw"
+    sent = 0.001 * np.repeat(np.arange(3, history + 3), 2)
+    np.testing.assert_allclose(observed[-1][:, 7:], np.tile(sent, (64, 1)), atol=1e-6)

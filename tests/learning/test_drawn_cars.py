@@ -49,6 +49,20 @@ def test_rollout_tick_by_tick_equals_the_simulator() -> None:
     torch.testing.assert_close(decode_history(features), commands[:, -HISTORY:])
 
 
+@pytest.mark.parametrize("history", [0, HISTORY, HISTORY + 4])
+def test_rollouts_have_the_past_commands_of_the_caller(history: int) -> None:
+    """The features of a step end with all past commands, and the step is that of the simulator after them."""
+    wanted = max(history, HISTORY)
+    cars = draw_cars(CAR, 4, torch.Generator().manual_seed(0), history)
+    commands = random_commands(4, wanted + 1)
+    features = torch.from_numpy(encode(np.zeros((4, 6)), commands[:, :wanted].numpy())).float()
+    after = start_rollouts(cars, 4, torch.Generator()).step(features, commands[:, -1], torch.Generator())
+    assert after.shape == (4, 7 + 2 * wanted)
+    torch.testing.assert_close(decode_history(after), commands[:, 1:])
+    expected = rollout(CAR, torch.zeros((4, 6)), commands[:, -1:], history=commands[:, :-1], values=cars.values)
+    torch.testing.assert_close(decode_state(after)[:, :2], expected.states[:, 1, :2])
+
+
 def test_most_unknown_effects_are_absent_and_the_others_are_plausible() -> None:
     cars = draw_cars(CAR, 4000, torch.Generator().manual_seed(0))
     lag = cars.values[LAG]

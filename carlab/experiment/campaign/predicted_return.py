@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.observation import STATE_FEATURES
+from carlab.core.observation import ACTION_SIZE, STATE_FEATURES
 from carlab.core.safety import SafetyEnvelope
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -63,9 +63,9 @@ def predicted_figures(
     shares = [1.0]
     prior = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
     if plan.method == "gp-sim-posterior":
-        cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed))
+        cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed), plan.history)
         cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
-        task = plan.task.resized(drawn_cars.HISTORY)
+        task = plan.task.resized(cars.history)
         environment = model_env.ModelEnv(
             cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed
         )
@@ -79,10 +79,11 @@ def predicted_figures(
 
 
 def _own_features(seen: NDArray[np.float32], history: int) -> NDArray[np.float32]:
-    """Policy inputs with only the last ``history`` past commands."""
+    """Policy inputs (N, 7 + 2 H) with only the last H = ``history`` of the past commands in ``seen``."""
     import numpy as np
 
-    first = seen.shape[1] - 2 * history
+    first = seen.shape[1] - ACTION_SIZE * history
+    assert first >= STATE_FEATURES, f"{seen.shape[1]} features hold fewer than {history} past commands"
     return np.concatenate([seen[:, :STATE_FEATURES], seen[:, first:]], axis=1)
 
 
