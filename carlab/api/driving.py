@@ -265,7 +265,7 @@ def _policy_and_task(
 
 
 def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple[Policy, Task]:
-    """The policy of a run, and its task or a given one, with the run's past actions and ticks."""
+    """The policy of a run, and its task or a given one, with the policy's past actions and the run's ticks."""
     from carlab.experiment.campaign.campaign import PERIOD_TOLERANCE
     from carlab.experiment.campaign.learned_policy import load_policy
 
@@ -279,7 +279,7 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
         )
     chosen = own.named_again(given) if given is None or given.name == own.name else given
     task = load_checked(chosen, choice.envelope.arena_m)
-    return learned.policy, task.resized(learned.plan.history, learned.plan.ticks)
+    return learned.policy, task.resized(learned.history, learned.plan.ticks)
 
 
 def _without_arena(policy: str | Policy, task: Task, choice: CarChoice) -> Task:

@@ -16,6 +16,7 @@ import pytest
 import tomli_w
 from learning_runs import TICKS, tiny_plan
 
+from carlab.api.driving import drive
 from carlab.cars import choose_car
 from carlab.core.documents import Tick
 from carlab.core.episode_data import EpisodeData
@@ -23,6 +24,7 @@ from carlab.core.errors import DataError
 from carlab.diagnosis.diagnose import diagnose
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.learned_policy import load_policy
 from carlab.experiment.campaign.prior_correction import (
     PARAMETERS,
     Correction,
@@ -44,6 +46,7 @@ from carlab.experiment.campaign.prior_correction_process import (
 from carlab.experiment.campaign.quick_check import check_path, run_check_subprocess
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.run_folder import RunDirectory
+from learning.policy.sac_agent import SacAgent, SacSettings, _without_environment
 from sim_backends.car_parameters import SimulatorConfig
 
 CAR = SimulatorConfig.from_preset()
@@ -263,6 +266,22 @@ def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: P
     assert all(f.predicted_low <= f.predicted_return <= f.predicted_high for f in figures)
     again = resumed_campaign(run, choice, hooks)
     assert again.current_plan(2).prior_toml == (run.models / "0002" / "prior.toml").read_text()
+    for policy, history in ((run.path, 4), (run.models / "0002", 4), (run.models / "0001", 2)):
+        driven = drive("sim", policy=policy, ticks=3, out=tmp_path / "driven", rerun=False, picture=False)
+        (tick, *_) = [d for d in read_documents(driven.recordings[0]) if isinstance(d, Tick)]
+        assert len(tick.features) == 7 + 2 * history, "each policy drives with its own number of past commands"
+
+
+def test_policy_with_impossible_past_commands_is_refused(tmp_path: Path) -> None:
+    run = RunDirectory.create(tmp_path, "odd")
+    Campaign(choice := choose_car("sim"), tiny_plan(choice), 1, run).write_plan()
+    (run.models / "0001").mkdir(parents=True)
+    for features in (3, 7 + 2 * 1, 7 + 2 * 2 + 1):
+        agent = SacAgent(SacSettings(), 0)
+        agent._sac = _without_environment(features, SacSettings(), 0)
+        agent.save(run.models / "0001")
+        with pytest.raises(DataError, match=rf"has {features} features, its run at least 11; remove the folder"):
+            load_policy(run.path)
 
 
 def test_correction_needs_the_file_of_the_check(lagging: RunDirectory, tmp_path: Path) -> None:

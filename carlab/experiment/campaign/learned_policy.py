@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carlab.core.errors import DataError
-from carlab.core.observation import feature_size
+from carlab.core.observation import ACTION_SIZE, STATE_FEATURES, feature_size
 from carlab.core.policy import Policy
 from carlab.experiment.campaign.campaign import saved_plan
+from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
@@ -17,11 +18,19 @@ from sim_backends.car_parameters import SimulatorConfig
 
 @dataclass(frozen=True, slots=True)
 class LearnedPolicy:
-    """A learned policy, the plan of its run, and the number of the episode before which it was trained."""
+    """A learned policy.
+
+    Attributes:
+        policy: the policy.
+        plan: plan of its run.
+        episode: number of the episode before which it was trained.
+        history: number of past commands that it observes; a corrected prior may need more than the plan states.
+    """
 
     policy: Policy
     plan: TrainingPlan
     episode: int
+    history: int
 
     @property
     def control_period_s(self) -> float:
@@ -43,12 +52,13 @@ def load_policy(folder: Path) -> LearnedPolicy:
     if not folders:
         raise DataError(f"{folder} has no policy; name the folder of a run of carlab learn with a finished training.")
     agent = SacAgent.load(folders[-1], SacSettings(), plan.seed)
-    if agent.observation_size != feature_size(plan.history):
+    history = (agent.observation_size - STATE_FEATURES) // ACTION_SIZE
+    if not plan.history <= history <= LARGEST_GIVEN_HISTORY or agent.observation_size != feature_size(history):
         raise DataError(
-            f"The policy in {folders[-1]} has {agent.observation_size} features, its run {feature_size(plan.history)}; "
-            "remove the folder."
+            f"The policy in {folders[-1]} has {agent.observation_size} features, its run at least "
+            f"{feature_size(plan.history)}; remove the folder to train again."
         )
-    return LearnedPolicy(agent.policy(), plan, int(folders[-1].name))
+    return LearnedPolicy(agent.policy(), plan, int(folders[-1].name), history)
 
 
 __all__ = ["LearnedPolicy", "load_policy"]
