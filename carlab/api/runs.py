@@ -85,6 +85,8 @@ def new_run(
 ) -> Iterator[RunDirectory]:
     """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty or missing.
 
+    The folder is locked until the end of the run.
+
     Raises:
         ConfigError: a child process executes the program's script again.
         DataError: the folder cannot be written.
@@ -93,27 +95,28 @@ def new_run(
 
     _refuse_second_execution()
     run = RunDirectory.create(out, name, config_toml=choice.config_toml)
-    try:
-        with _logged(run, choice, hooks):
-            yield run
-    finally:
-        if not any((run.path / keep).glob("*")):
-            shutil.rmtree(run.path, ignore_errors=True)
+    with run.locked():
+        try:
+            with _logged(run, choice, hooks):
+                yield run
+        finally:
+            if not any((run.path / keep).glob("*")):
+                shutil.rmtree(run.path, ignore_errors=True)
 
 
 @contextmanager
 def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterator[RunDirectory]:
-    """Open the folder of a resumed run; the program's log is appended.
+    """Open the folder of a resumed run, and lock it until the end of the run; the program's log is appended.
 
     Raises:
-        ConfigError: a child process executes the program's script again.
+        ConfigError: another process writes the run, or a child process executes the program's script again.
         DataError: the path is not a run's folder, or it cannot be written.
     """
     from carlab.recording.run_folder import RunDirectory
 
     _refuse_second_execution()
     run = RunDirectory.open_existing(path)
-    with _logged(run, choice, hooks):
+    with run.locked(), _logged(run, choice, hooks):
         yield run
 
 

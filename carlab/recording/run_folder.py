@@ -8,11 +8,13 @@ runs/2026-11-21_134500_<name>/
     models/0001/         learned models and policies of a learning run
     log.jsonl            the program's log, one JSON object per line
     result.json          the result of the run
+    .lock                an empty file; the process of a run holds its lock
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import importlib.metadata
 import json
 import logging
@@ -21,14 +23,14 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
 from carlab.core.clock import wall_clock_ns
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.core.version import VERSION
 from carlab.recording.sink import describe_os_error
 
@@ -36,7 +38,9 @@ _PACKAGES = (
     *("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "rerun-sdk", "mcap", "protobuf", "pyarrow"),
     *("python-can", "pyserial", "cantools"),
 )
-RESULT_FILE = "result.json"
+log = logging.getLogger(__name__)
+
+RESULT_FILE, LOCK_FILE = "result.json", ".lock"
 _EPISODE_FILE = re.compile(r"(\d+)\.(?:mcap|rrd)(?:\.partial)?")
 
 
@@ -94,6 +98,28 @@ class RunDirectory:
         except OSError as error:
             raise DataError(describe_os_error(error, path)) from error
         return run
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Context in which no other process may write the run; the lock ends with the process at the latest.
+
+        Raises:
+            ConfigError: another run holds the lock.
+            DataError: the file of the lock cannot be opened.
+        """
+        path = self.path / LOCK_FILE
+        try:
+            file = path.open("ab")
+        except OSError as error:
+            raise DataError(describe_os_error(error, path)) from error
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ConfigError(f"{self.path} is in use by another run; wait until that run ends.") from error
+            except OSError as error:  # a file system without locks
+                log.warning("%s cannot be locked (%s); resume it in one process only.", self.path, error.strerror)
+            yield
 
     @property
     def episodes(self) -> Path:
