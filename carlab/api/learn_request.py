@@ -76,6 +76,7 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
     task = load_checked(task_choice, choice.envelope.arena_m)
     if (ticks := request.ticks or task.max_ticks) <= history:
         raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
+    task.resized(history, request.ticks)
     text = tomli_w.dumps(_prior(request, choice).to_tables())
     return TrainingPlan(
         text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,

@@ -17,6 +17,7 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from carlab.core.angles import wrap
+from carlab.core.errors import ConfigError
 from carlab.core.geofence import rectangle
 from carlab.core.keep_out import Corners, Disc, KeepOut
 from carlab.core.observation import ACTION_SIZE, encode
@@ -115,11 +116,21 @@ class Task(ABC):
         return "success" if summary["success"] else "no success"
 
     def resized(self, history_length: int, max_ticks: int | None = None) -> Self:
-        """Copy with another number of past actions, and of ticks if given."""
+        """Copy with another number of past actions, and of ticks if given.
+
+        Raises:
+            ConfigError: the task does not let a run set them, for example because one is a property.
+        """
         changed = copy.copy(self)
-        object.__setattr__(changed, "history_length", history_length)
-        if max_ticks is not None:
-            object.__setattr__(changed, "max_ticks", max_ticks)
+        values = {"history_length": history_length} | ({} if max_ticks is None else {"max_ticks": max_ticks})
+        for name, value in values.items():
+            try:
+                object.__setattr__(changed, name, value)
+            except AttributeError as error:
+                raise ConfigError(
+                    f"A run cannot set {name} of the task {self.name} to {value} ({error}); make it an attribute of "
+                    "the class."
+                ) from error
         return changed
 
 

@@ -37,6 +37,11 @@ class Forward(Task):
     def success(self, features):
         return features[..., 0] > 0.5
 
+class Timed(Forward):
+    @property
+    def max_ticks(self):
+        return 30
+
 class Broken(Forward):
     def reward(self, features, action, next_features):
         return next_features[..., 0:1]
@@ -120,6 +125,15 @@ def test_wrong_task_is_refused_before_anything_is_written(carlab: Carlab, file: 
         code, text = carlab(verb, "--task", f"{file}:Broken", *options)
         assert code == 2
         assert "The task Broken has an error: reward returns the shape" in text
+    assert not (tmp_path / "runs").exists()
+
+
+def test_ticks_of_a_task_with_its_own_number_are_refused_before_the_training(
+    carlab: Carlab, file: Path, tmp_path: Path
+) -> None:
+    code, text = carlab("learn", "--task", f"{file}:Timed", "--ticks", 20, "--out", tmp_path / "runs")
+    assert code == 2
+    assert "A run cannot set max_ticks of the task forward to 20" in text
     assert not (tmp_path / "runs").exists()
 
 

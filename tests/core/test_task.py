@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from carlab.core.errors import ConfigError
 from carlab.core.geofence import contains
 from carlab.core.keep_out import Disc, Polygon
 from carlab.core.observation import ActionHistory, decode_history, decode_state, encode, feature_size
@@ -177,3 +178,18 @@ def test_default_cost_counts_the_shapes_that_are_entered() -> None:
     assert Field().cost(features_of(states)).tolist() == [0.0, 1.0, 2.0, 1.0]
     assert Field().has_constraint
     assert not ParkingTask().has_constraint
+
+
+def test_task_whose_ticks_are_a_property_has_its_own_ticks_only() -> None:
+    class Timed(Task):
+        max_ticks = property(lambda self: 30)  # type: ignore[assignment]
+
+        def sample_start(self, rng: np.random.Generator) -> CarState:
+            return CarState()
+
+        def reward(self, features: np.ndarray, action: np.ndarray, next_features: np.ndarray) -> np.ndarray:
+            return next_features[..., 0]
+
+    assert (Timed().resized(5).history_length, Timed().resized(5).max_ticks) == (5, 30)
+    with pytest.raises(ConfigError, match=r"cannot set max_ticks of the task task to 40 .*; make it an attribute of"):
+        Timed().resized(5, 40)

@@ -66,6 +66,12 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"name": ""}, "name is ''"),
     ({"max_ticks": 0}, "max_ticks is 0"),
     ({"max_ticks": 10.0}, "max_ticks is 10.0"),
+    (
+        {"history_length": property(lambda self: 3)},
+        "cannot set history_length of the task reach to 4 .* make it an attr",
+    ),
+    ({"resized": lambda self, history, ticks=None: self}, "must return the task with history_length 4"),
+    ({"resized": lambda self, history, ticks=None: None}, "must return the task with history_length 4"),
     ({"goal": (100.0, 0.0, 0.0)}, "the goal .* is outside the arena; positions are in metres"),
     ({"goal": (1.0, 0.0, 90.0)}, "yaw of 90; angles are in radians"),
     ({"goal": (1.0, 0.0)}, "goal is"),

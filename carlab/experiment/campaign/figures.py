@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError
 from carlab.core.observation import decode_state
 from carlab.core.quantities import FloatArray
 from carlab.core.task import Task
@@ -125,7 +127,11 @@ def _with_nan(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def figures_of(result: EpisodeResult, training: Mapping[str, Any], task: Task) -> EpisodeFigures:
-    """Combine the result of an episode with the figures of the training before it."""
+    """Combine the result of an episode with the figures of the training before it.
+
+    Raises:
+        ConfigError: the task cannot state the outcome.
+    """
     summary = {**dict.fromkeys(_SUMMARY_FIELDS, float("nan")), **result.summary}
     return EpisodeFigures(
         episode=int(training["episode"]),
@@ -145,12 +151,23 @@ def figures_of(result: EpisodeResult, training: Mapping[str, Any], task: Task) -
         predicted_low=float(training.get("predicted_low", float("nan"))),
         predicted_high=float(training.get("predicted_high", float("nan"))),
         prior_change=str(training.get("prior_change", "")),
-        outcome=task.outcome(summary),
+        outcome=_outcome(task, summary, result.path),
         cost=summary["cost"],
         violations=summary["violations"],
         predicted_cost=float(training.get("cost_in_model", float("nan"))),
         task_figures={k: float(v) for k, v in summary.items() if k not in (*_SUMMARY_FIELDS, "success")},
     )
+
+
+def _outcome(task: Task, summary: Mapping[str, float], recording: Path) -> str:
+    """The outcome of an episode in the words of the task. Raises ConfigError if it gives none."""
+    try:
+        return str(task.outcome(summary))
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"The task {task.name} cannot state the outcome of {recording} ({type(error).__name__}: {error}); correct "
+            "its outcome; the recording is complete."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,6 +99,10 @@ def _check_attributes(task: Task) -> None:
     outlines = values["outlines_m"]
     if not isinstance(outlines, (tuple, list)) or not all(map(_are_points, outlines)):
         raise _error(task, "outlines_m must be a tuple of lines, each a tuple of points (x, y) in metres")
+    longer = values["history_length"] + 1
+    resized = _call(task, "resized", task.resized, longer)
+    if not isinstance(resized, Task) or resized.history_length != longer:
+        raise _error(task, f"resized({longer}) must return the task with history_length {longer}")
     if values["arena_m"]:
         as_polygon(values["arena_m"], f"arena_m of the task {type(task).__name__}")
 
