@@ -33,7 +33,7 @@ STEPS_PERIOD_S = 600.0
 
 def _training_messages(figures: dict[str, Any]) -> list[str]:
     """Sentences about past commands and ticks, from the figures of a training."""
-    messages = [str(figures["history_message"])] if "supported_history" in figures else []
+    messages = [figures["history_message"]] if "history_message" in figures else []
     if (ticks := figures.get("needed_ticks")) is not None:
         messages.append(
             f"In the learned car the policy parks only in longer episodes: in half of them within {ticks} ticks. Start "
@@ -202,7 +202,7 @@ class Learn:
 
         def on_learned(figures: dict[str, Any]) -> None:
             for message in _training_messages(figures):
-                bar.console.print(f"  {message}", soft_wrap=True, highlight=False)
+                bar.console.print(f"  {message}", soft_wrap=True, markup=False, highlight=False)
 
         def on_check(check: EpisodeCheck) -> None:
             for sentence in check.sentences:

@@ -263,6 +263,11 @@ def payload_in_the_policy(folder: Path, created: Path) -> None:
         np.savez(file, version=np.array([Payload(created)], dtype=object))
 
 
+def without_rows(folder: Path, created: Path) -> None:
+    figures = json.loads((folder / "training.json").read_text())
+    (folder / "training.json").write_text(json.dumps(figures | {"rows": None}))
+
+
 def other_episode(folder: Path, created: Path) -> None:
     figures = json.loads((folder / "training.json").read_text())
     (folder / "training.json").write_text(json.dumps(figures | {"episode": 7}))
@@ -275,6 +280,7 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path], object], str]] = {
     "history": (other_history, "another number of past commands"),
     "episode": (other_episode, "of episode 7"),
     "figures": (lambda folder, created: (folder / "training.json").write_text("["), "training.json cannot be read"),
+    "figures without a number": (without_rows, "rows is None, not a count"),
     "truncated model": (lambda folder, created: (folder / "dynamics.npz").write_bytes(b"PK"), "The learned car in"),
     "code in the model": (payload_in_the_model, "The learned car in"),
     "pickled array in the model": (pickled_array_in_the_model, "The learned car in"),

@@ -75,6 +75,15 @@ def test_learning_run_ends_with_one_sentence_when_the_disk_is_full(
     run, choice = RunDirectory.create(tmp_path, "full"), choose_car("sim", seed=0)
     plan = TrainingPlan("", ticks=20)
     model_folder(run.models, 1).mkdir(parents=True)
+    figures = {
+        "episode": 1,
+        "rows": 0,
+        "updates": 1,
+        "return_in_model": 0.0,
+        "model_seconds": 0.0,
+        "policy_seconds": 0.0,
+    }
+    (model_folder(run.models, 1) / "training.json").write_text(json.dumps(figures))
 
     class Untrained:
         def policy(self) -> NeutralPolicy:

@@ -176,6 +176,7 @@ class Campaign:
                 self.hooks.on_learned(trained)
             if self.hooks.stop():
                 return
+            training = training_figures(self.run, done + 1)
             result = self._drive(done + 1)
             if result is None or result.reason in STOPPED:
                 self.move_stopped_episode()
@@ -185,7 +186,7 @@ class Campaign:
             continues = self._may_continue(result.reason)
             if continues and result.reason.is_safety_stop:
                 self.choice.car.reset_fault()
-            self.hooks.on_figures(figures_of(result, training_figures(self.run, done + 1), self.plan.task))
+            self.hooks.on_figures(figures_of(result, training, self.plan.task))
             self._check()
             yield result
             if not continues:

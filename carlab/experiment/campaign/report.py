@@ -50,7 +50,7 @@ def restore_missing_rows(run: RunDirectory, task: Task) -> None:
         try:
             training = training_figures(run, number)
             save_row(run, figures_of(result_of(number, read_episode(path), task, path), training, task))
-        except (DataError, OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning("The row of episode %d in %s cannot be restored: %s", number, CURVE_FILE, error)
 
 

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError, DivergedError
-from carlab.core.json_files import read_json
 from carlab.core.observation import episode_features, feature_size
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.state_estimator import StateEstimator
+from carlab.experiment.campaign.figures_file import FIGURES_FILE, read_training_figures
 from carlab.experiment.campaign.predicted_return import predicted_figures
 from carlab.experiment.campaign.prior_correction_process import read_version
 from carlab.experiment.campaign.training_plan import TrainingPlan
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DYNAMICS_FILE = "dynamics.pt"
-FIGURES_FILE = "training.json"
 PRIOR_FILE = "prior.toml"
 N_EVALUATION_CARS = 64
 SUCCESS_BONUS, SUCCESS_SCORE = 0.3, 10.0
@@ -73,13 +72,13 @@ def training_figures(run: RunDirectory, episode: int) -> dict[str, Any]:
     """Figures of the training before an episode, and the change of the prior before it.
 
     Raises:
-        DataError: the file cannot be read.
+        DataError: the file cannot be read, or a figure is missing or has another type.
     """
-    path = model_folder(run.models, episode) / FIGURES_FILE
+    folder = model_folder(run.models, episode)
     try:
-        figures: dict[str, Any] = read_json(path)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}); remove its folder to train again.") from error
+        figures = read_training_figures(folder, episode)
+    except DataError as error:
+        raise DataError(f"In {folder}, {error}; remove the folder to train again.") from error
     version = read_version(run, episode - 1)
     return figures if version is None else {**figures, "prior_change": version.sentence}
 

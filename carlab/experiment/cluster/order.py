@@ -26,7 +26,8 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
 from carlab.core.observation import feature_size
 from carlab.core.safety import SafetyEnvelope
-from carlab.experiment.campaign.training import DYNAMICS_FILE, FIGURES_FILE, PRIOR_FILE, model_folder
+from carlab.experiment.campaign.figures_file import FIGURES_FILE, read_training_figures
+from carlab.experiment.campaign.training import DYNAMICS_FILE, PRIOR_FILE, model_folder
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
 from learning.world.car_fit import load_car, load_car_arrays, save_car, save_car_arrays
@@ -135,12 +136,7 @@ class TrainingOrder:
         agent = SacAgent.load(arrived, SacSettings(), self.plan.seed)
         if (car.history, agent.observation_size) != (self.plan.history, feature_size(self.plan.history)):
             raise DataError("model and policy have another number of past commands")
-        try:
-            figures = read_json(arrived / FIGURES_FILE)
-        except (OSError, ValueError) as error:
-            raise DataError(f"{FIGURES_FILE} cannot be read ({error})") from error
-        if figures.get("episode") != self.number:
-            raise DataError(f"they are of episode {figures.get('episode')}")
+        figures = read_training_figures(arrived, self.number)
         save_car(car, arrived / DYNAMICS_FILE)
         return figures
 
