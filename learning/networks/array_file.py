@@ -6,7 +6,10 @@ An untrusted file must not run code. ``torch.load`` and stable-baselines3 unpick
 from __future__ import annotations
 
 import io
+import struct
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,9 +22,11 @@ from carlab.core.errors import DataError
 
 MAX_BYTES = 256_000_000
 """Maximum size of the arrays of one file; a policy or a learned car has some hundred kilobytes."""
+TOO_LARGE = f"it holds more than {MAX_BYTES / 1e6:.0f} MB"
 _UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, NotImplementedError, RuntimeError),
-    *(zipfile.BadZipFile, zipfile.LargeZipFile, SyntaxError, RecursionError),
+    *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, SyntaxError, RecursionError, tokenize.TokenError),
+    *(ArithmeticError, struct.error),
 )
 
 
@@ -40,9 +45,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
             is a clause without a remedy.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
-                raise DataError(f"it holds more than {MAX_BYTES / 1e6:.0f} MB")
+        check_archive(path)
         with np.load(path, allow_pickle=False) as opened:
             arrays = {name: opened[name] for name in opened.files}
     except _UNREADABLE as error:
@@ -51,6 +54,17 @@ def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
             raise DataError(f"{name} holds no numbers")
     return arrays
+
+
+def check_archive(path: Path) -> None:
+    """Raise DataError (a clause) if the members of a ZIP file have more than ``MAX_BYTES``, BadZipFile if it is none.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
+            raise DataError(TOO_LARGE)
 
 
 def checked_tensor(arrays: Mapping[str, NDArray[np.generic]], name: str, shape: tuple[int, ...]) -> Tensor:
@@ -73,4 +87,4 @@ def whole_number(arrays: Mapping[str, NDArray[np.generic]], name: str) -> int:
     return int(array)
 
 
-__all__ = ["checked_tensor", "read_arrays", "whole_number", "write_arrays"]
+__all__ = ["MAX_BYTES", "TOO_LARGE", "check_archive", "checked_tensor", "read_arrays", "whole_number", "write_arrays"]

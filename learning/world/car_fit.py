@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Callable
+import struct
+import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -15,7 +17,7 @@ from torch import Tensor
 from carlab.core.errors import DataError
 from carlab.core.observation import STATE_FEATURES
 from learning.functional_svgd.authors_fsvgd import WorldDynamics
-from learning.networks.array_file import read_arrays, whole_number, write_arrays
+from learning.networks.array_file import MAX_BYTES, TOO_LARGE, check_archive, read_arrays, whole_number, write_arrays
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
@@ -38,7 +40,11 @@ PRIOR_FUNCTION = 1.0
 """Prior sizes of a simulator's discrepancy, and of a step without a simulator, in units of the outputs."""
 MAX_ROWS = 800
 """Maximum number of rows of the fit; a random subset of more."""
+MAX_NETWORK_SIZE = 10_000
+"""Maximum width of a layer in a file; a learned car has 64 units per layer and at most some hundred inputs."""
 _UNIT_SAMPLES = 2000
+_MAX_SHOWN = 6
+"""Maximum number of sizes in a message."""
 _UNITS = ("input_mean", "input_std", "output_mean", "output_std")
 _DOF_KEY, _DECORRELATION_KEY, _INPUT_CLIP_KEY = "freedom", "turn", "reach"
 """Names in the files of the degrees of freedom, the decorrelation of the outputs, and the bounds of the inputs."""
@@ -161,7 +167,16 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
     Raises:
         DataError: the file cannot be read, or has another version or shape.
     """
-    return _read(path, device, lambda: torch.load(path, weights_only=True, map_location="cpu"))
+
+    def read() -> dict[str, Any]:
+        try:
+            check_archive(path)
+        except DataError as error:  # A clause without the file and a remedy.
+            raise ValueError(str(error)) from error
+        content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+        return content
+
+    return _read(path, device, read)
 
 
 def save_car_arrays(dynamics: LearnedCar, path: Path) -> None:
@@ -230,67 +245,79 @@ def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, A
         version = content["version"]
         if version != FILE_VERSION:
             raise DataError(f"{path} has version {version}, this program reads version {FILE_VERSION}; {remedy}.")
-        inputs, outputs, *hidden = content["network"]
-        network = Network(inputs, outputs, tuple(hidden), content["activation"])
-        parameters: Tensor = content["parameters"]
-        count = parameters.shape[1]
-        units = Normaliser(*content["units"])
-        if content[_DECORRELATION_KEY] is not None:
-            units = units.decorrelated(content[_DECORRELATION_KEY])
-        noise_std, dof = content["noise_std"], float(content[_DOF_KEY])
-        optional = (content[name] for name in ("trend", "correlation", _INPUT_CLIP_KEY))
-        posterior = ParticlePosterior(network, parameters, noise_std, units, dof, *optional)
-        frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
-        car: LearnedCar = frames[content.get("frame", "body")](posterior, content["history"])
-        if count == network.parameters:
-            _check_shapes(car)
-            car = type(car)(posterior.to(device), car.history)
+        return _car_of(content, device)
     except DataError:
         raise
     except pickle.UnpicklingError as error:  # its own message recommends to read the file unsafely
         raise DataError(f"{path} holds more than numbers, so it is no learned car; {remedy}.") from error
     except _READ_ERRORS as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first_line(error)}); {remedy}.") from error
-    if count != network.parameters:
-        raise DataError(f"{path} holds {count} parameters per particle, not {network.parameters}; {remedy}.")
-    return car
 
 
-def _check_shapes(car: LearnedCar) -> None:
-    """Raise ValueError if the parts of a file have inconsistent shapes; the file may be untrusted."""
-    posterior, units = car.posterior, car.posterior.normaliser
-    d, o = posterior.network.inputs, posterior.network.outputs
-    state_inputs = 3 if isinstance(car, CarDynamics) else STATE_FEATURES
-    if type(car.history) is not int or car.history < 0 or d != state_inputs + 2 * (car.history + 1):
-        raise ValueError(f"a history of {car.history} and {d} inputs")
-    if o != (len(OUTPUTS) if isinstance(car, CarDynamics) else STATE_FEATURES) or not posterior.dof > 0.0:
-        raise ValueError(f"{o} outputs and {posterior.dof} degrees of freedom")
-    parts = {
-        "parameters": (posterior.parameters, (max(len(posterior.parameters), 1), posterior.network.parameters)),
-        "noise_std": (posterior.noise_std, (o,)), "input_mean": (units.input_mean, (d,)),
-        "input_std": (units.input_std, (d,)), "output_mean": (units.output_mean, (o,)),
-        "output_std": (units.output_std, (o,)), _DECORRELATION_KEY: (units.decorrelation, (o, o)),
-        "trend": (posterior.trend, (1 + d, o)), "correlation": (posterior.correlation, (o, o)),
-        _INPUT_CLIP_KEY: (posterior.input_clip, (d,)),
+def _car_of(content: Mapping[str, Any], device: torch.device | str) -> LearnedCar:
+    """The car of a file's content; all shapes are checked before anything is computed, because it may be untrusted.
+
+    Raises:
+        One of ``_READ_ERRORS``: a part is missing, or has another type or shape.
+    """
+    inputs, outputs, *hidden = content["network"]
+    network = Network(inputs, outputs, tuple(hidden), content["activation"])
+    frame, history, dof = content.get("frame", "body"), content["history"], float(content[_DOF_KEY])
+    _check_sizes(network, frame, history)
+    if not dof > 0.0:
+        raise ValueError(f"{dof} degrees of freedom")
+    _check_parts(content, network)
+    units = Normaliser(*content["units"])
+    if content[_DECORRELATION_KEY] is not None:
+        units = units.decorrelated(content[_DECORRELATION_KEY])
+    optional = (content[name] for name in ("trend", "correlation", _INPUT_CLIP_KEY))
+    posterior = ParticlePosterior(network, content["parameters"], content["noise_std"], units, dof, *optional)
+    frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
+    return frames[frame](posterior.to(device), history)
+
+
+def _check_sizes(network: Network, frame: str, history: int) -> None:
+    """Raise ValueError if the sizes of a network are no counts, or do not belong to the frame and the history."""
+    sizes = (network.inputs, network.outputs, *network.hidden)
+    if not all(type(size) is int and 0 < size <= MAX_NETWORK_SIZE for size in sizes):
+        raise ValueError(f"a network of {', '.join(map(str, sizes[:_MAX_SHOWN]))}")
+    state_inputs, outputs = {"body": (3, len(OUTPUTS)), "world": (STATE_FEATURES, STATE_FEATURES)}[frame]
+    if type(history) is not int or history < 0 or network.inputs != state_inputs + 2 * (history + 1):
+        raise ValueError(f"a history of {history} and {network.inputs} inputs")
+    if network.outputs != outputs:
+        raise ValueError(f"{network.outputs} outputs")
+
+
+def _check_parts(content: Mapping[str, Any], network: Network) -> None:
+    """Raise ValueError if an array of a file has another shape than the network, or if all together are too large."""
+    d, o = network.inputs, network.outputs
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "parameters": (None, network.parameters), "noise_std": (o,), "input_mean": (d,), "input_std": (d,),
+        "output_mean": (o,), "output_std": (o,), _DECORRELATION_KEY: (o, o), "trend": (1 + d, o),
+        "correlation": (o, o), _INPUT_CLIP_KEY: (d,),
     }  # fmt: skip
-    for name, (part, shape) in parts.items():
-        if part is None and name in _OPTIONAL_KEYS:
-            continue
+    parts = dict(content) | dict(zip(_UNITS, content["units"], strict=True))
+    given = {name: parts[name] for name in shapes if name not in _OPTIONAL_KEYS or parts[name] is not None}
+    total = 0
+    for name, part in given.items():
         if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
             raise ValueError(f"{name} is not an array of numbers")
-        if tuple(part.shape) != shape or not torch.isfinite(part).all():
-            raise ValueError(f"{name} has shape {tuple(part.shape)}, not {shape}, or is not finite")
+        size = part.numel() * part.element_size()
+        if part.device.type != "cpu" or part.untyped_storage().nbytes() < size:  # one stored number at many indices
+            raise ValueError(f"{name} has fewer numbers than its shape")
+        total += size
+        wanted = tuple(size or max(len(part), 1) for size in shapes[name]) if part.ndim else shapes[name]
+        if tuple(part.shape) != wanted:
+            raise ValueError(f"{name} has shape {tuple(part.shape)}, not {wanted}")
+    if total > MAX_BYTES:
+        raise ValueError(TOO_LARGE)
+    if infinite := next((name for name, part in given.items() if not torch.isfinite(part).all()), None):
+        raise ValueError(f"{infinite} is not finite")
 
 
 _READ_ERRORS = (
-    OSError,
-    RuntimeError,
-    EOFError,
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    pickle.UnpicklingError,
+    *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError),
+    *(ArithmeticError, MemoryError, struct.error, pickle.UnpicklingError, zipfile.BadZipFile),
 )
 
 
