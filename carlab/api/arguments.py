@@ -7,6 +7,7 @@ import numbers
 from typing import Any
 
 from carlab.core.errors import ConfigError
+from carlab.core.seeds import MAX_SEED
 
 
 def above_zero(**values: Any) -> None:
@@ -31,6 +32,12 @@ def at_least(minimum: int, **values: Any) -> None:
     for name, value in values.items():
         if value is not None and value < minimum:
             raise ConfigError(f"--{name.replace('_', '-')} {value}: give at least {minimum}.")
+
+
+def valid_seed(**values: Any) -> None:
+    """Raise ConfigError for a seed that is no integer from 0 to ``MAX_SEED``; None is valid."""
+    at_least(0, **values)
+    at_most(MAX_SEED, **values)
 
 
 def at_most(maximum: int, **values: Any) -> None:

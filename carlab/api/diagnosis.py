@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from carlab.api.arguments import at_least
+from carlab.api.arguments import at_least, valid_seed
 from carlab.api.cars import load_car
 from carlab.api.loaded_recordings import LoadedRecordings, RecordingLike, as_list, assigned, load_recordings
 
@@ -175,6 +175,7 @@ def diagnose(
         DataError: a recording cannot be read, or the report cannot be written.
     """
     at_least(1, jobs=jobs)
+    valid_seed(seed=seed)
     file = load_car(car)
     effects = _checked_effects(effects)
     fit, validation = _read_recordings(recordings, held_out, holdout_share, file)

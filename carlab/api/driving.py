@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from carlab.api.arguments import above_zero, at_least
+from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.api.drive_run import DriveRun, results_kept
 from carlab.api.runs import (
     RunHooks,
@@ -142,7 +142,7 @@ def replay(
     from carlab.experiment.episodes.scripted_policies import ReplayPolicy
 
     above_zero(seconds=seconds)
-    at_least(0, seed=seed)
+    valid_seed(seed=seed)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     episode = (recording if isinstance(recording, Recording) else load(recording)).episode
     run = drive(
@@ -223,7 +223,7 @@ def _check(
 
     check_main_thread()
     at_least(1, episodes=episodes, ticks=ticks)
-    at_least(0, seed=seed)
+    valid_seed(seed=seed)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():
         raise ConfigError(
             f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn."

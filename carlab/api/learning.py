@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
-from carlab.api.arguments import above_zero, at_least, at_most, whole_number
+from carlab.api.arguments import above_zero, at_least, at_most, valid_seed, whole_number
 from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
     RunHooks,
@@ -309,7 +309,8 @@ def _check(request: LearnRequest) -> None:
     counts = {name: getattr(request, name) for name in ("episodes", "updates", "ticks", "model_steps")}
     above_zero(**counts)
     whole_number(**counts)
-    at_least(0, history=request.history, seed=request.seed)
+    at_least(0, history=request.history)
+    valid_seed(seed=request.seed)
     at_most(LARGEST_GIVEN_HISTORY, history=request.history)
     above_zero(ray_wait=request.ray_wait)
     if not request.ray:

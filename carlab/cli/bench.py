@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from carlab.api.arguments import above_zero, at_least
+from carlab.api.arguments import above_zero, at_least, at_most
 from carlab.cli.bench_options import BenchOptions, check_options, row_counts
 from carlab.cli.bench_output import write_figures
 from carlab.cli.console import console, table
 from carlab.cli.options import json_file
+from carlab.core.seeds import MAX_SEED
 
 
 @dataclass
@@ -31,6 +32,7 @@ class Bench(BenchOptions):
             **{"rows": min(counts)} if (counts := row_counts(self)) else {},
         )  # fmt: skip
         at_least(0, first_seed=self.first_seed)
+        at_most(MAX_SEED + 1 - self.seeds, first_seed=self.first_seed)
         if self.what == "realcars":
             from carlab.cli.bench_realcars import run_realcars
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 from rich.text import Text
 
-from carlab.api.arguments import at_least
+from carlab.api.arguments import valid_seed
 from carlab.cli.console import console
 from carlab.cli.options import log_file
 from carlab.core.errors import ConfigError, NotReadyError
@@ -66,6 +66,7 @@ class Emulate:
         from drivers.calibration import ActuatorCalibration
 
         self._check_options()
+        valid_seed(seed=self.seed)
         file = default_car() if self.vehicle is None else load_car_file(self.vehicle)
         config = WorldConfig(
             simulator=file.simulator.to_tables(),
@@ -98,7 +99,6 @@ class Emulate:
         return 0
 
     def _check_options(self) -> None:
-        at_least(0, seed=self.seed)
         if self.log is not None:
             log_file(self.log, "--log")
         for name, port in (("command-port", self.command_port), ("data-port", self.data_port)):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from carlab.api.arguments import above_zero, at_least
+from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.cli.console import console, fail, progress, table
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
@@ -105,7 +105,7 @@ class Prove:
         from carlab.experiment.episodes.interrupts import Interrupts
 
         above_zero(jobs=self.jobs, timeout=self.timeout)
-        at_least(0, seed=self.seed)
+        valid_seed(seed=self.seed)
         at_least(1, limit=self.limit)
         if self.ray and self.simulator != "own":
             raise ConfigError("--ray needs --simulator own; leave one of them out.")

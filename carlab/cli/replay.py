@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from carlab.api.arguments import above_zero
+from carlab.api.arguments import above_zero, valid_seed
 from carlab.api.recordings import load
 from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, progress, table
@@ -78,8 +78,7 @@ class Replay:
     def run(self) -> int:
         """Predict or drive, and print."""
         above_zero(horizon=self.horizon_s, stride=self.stride_s, seconds=self.seconds)
-        if self.seed < 0:
-            raise ConfigError(f"--seed {self.seed}: at least 0.")
+        valid_seed(seed=self.seed)
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
         simulated = self.car.choose(seed=self.seed).car.reality is Reality.SIMULATED

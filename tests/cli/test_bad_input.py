@@ -296,6 +296,12 @@ def test_misspelt_option_is_refused_with_a_suggestion(carlab: Carlab) -> None:
     ("command", "parts"),
     [
         ("drive --seed -1", ["--seed"]),
+        ("drive --seed 4294967296", ["--seed 4294967296: give at most 4294967295."]),
+        ("replay drive.csv --seed 4294967296", ["--seed 4294967296: give at most 4294967295."]),
+        ("diagnose drive.csv --seed 4294967296", ["--seed 4294967296: give at most 4294967295."]),
+        ("emulate --seed 4294967296", ["--seed 4294967296: give at most 4294967295."]),
+        ("prove --out proof --seed 4294967296", ["--seed 4294967296: give at most 4294967295."]),
+        ("bench parking --seeds 3 --first-seed 4294967294", ["--first-seed 4294967294: give at most 4294967293."]),
         ("drive --ticks 0", ["--ticks"]),
         ("drive --max-throttle 2", ["--max-throttle"]),
         ("drive --max-throttle nan", ["--max-throttle"]),

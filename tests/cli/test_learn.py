@@ -76,6 +76,7 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
         ("--history -1", "--history -1: give at least 0."),
         ("--history 101", "--history 101: give at most 100."),
         ("--seed -1", "--seed -1: give at least 0."),
+        ("--seed 4294967296", "--seed 4294967296: give at most 4294967295."),
         ("--ray local --ray-wait 0", "--ray-wait 0: give a number above zero."),
         ("--ticks 0", "--ticks 0: give a number above zero."),
         ("--history 100", "--ticks 100: give more than --history (100), for at least one transition."),
@@ -196,6 +197,8 @@ def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_pat
         (("plan",), "x"),
         (("plan", "seed"), -1),
         (("plan", "seed"), math.inf),
+        (("plan", "seed"), 2**32),
+        (("plan", "history"), 101),
         (("plan", "updates"), 10**400),
     ],
 )

@@ -117,6 +117,8 @@ def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, 
         {"device": "mps"},
         {"ticks": 0},
         {"seed": 1.5},
+        {"seed": 2**32},
+        {"history": 101},
     ]
     invalid_plans = [json.dumps({**complete, "plan": {**complete["plan"], **change}}) for change in changes]
     for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}', *invalid_plans):

@@ -27,6 +27,7 @@ from carlab.core.json_files import read_json
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.seeds import MAX_SEED
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.prior_correction import PriorVersion, corrected, without_ranges
 from carlab.experiment.campaign.prior_correction_process import (
@@ -327,7 +328,7 @@ def saved_seed(folder: Path) -> int | None:
     """The seed of a run; None if the folder is not a campaign (``resumed_campaign`` raises then)."""
     try:
         seed = int(read_json(folder / CAMPAIGN_FILE)["plan"]["seed"])
-        return seed if seed >= 0 else None
+        return seed if 0 <= seed <= MAX_SEED else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -8,8 +8,10 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
 from carlab.core.method_names import current_method
+from carlab.core.seeds import MAX_SEED
 from carlab.core.task import Task
 from carlab.core.task_choice import PARKING, TaskChoice
+from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
 from learning.world.car_fit import Method
 
 log = logging.getLogger(__name__)
@@ -17,6 +19,9 @@ log = logging.getLogger(__name__)
 PLAN_VERSION = 2
 EARLIER_NAMES = {"sim-fsvgd": "gp-sim-posterior", "fsvgd": "gp-posterior", "fsvgd-authors": "fsvgd"}
 """Methods of plans of version 1 by their current names."""
+MIN_VALUES = {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}
+MAX_VALUES = {"history": LARGEST_GIVEN_HISTORY, "seed": MAX_SEED}
+"""Ranges of the integers of a plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +96,11 @@ def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
     plan = TrainingPlan(**{**values, "method": method, "task_choice": task_choice})
     if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
         raise ValueError("prior, method or device of the plan")
-    for name, minimum in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
+    for name, minimum in MIN_VALUES.items():
         value = getattr(plan, name)
         if value is None and name in ("model_steps", "ticks"):
             continue
-        if type(value) is not int or value < minimum:
+        if type(value) is not int or not minimum <= value <= MAX_VALUES.get(name, value):
             raise ValueError(f"{name} of the plan is {value!r}")
     return plan
 
