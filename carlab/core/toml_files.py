@@ -1,4 +1,4 @@
-"""Read TOML files that a person wrote."""
+"""Read TOML files that a person wrote, and TOML texts in other files."""
 
 from __future__ import annotations
 
@@ -24,16 +24,29 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
-        return text, tomllib.loads(text)
+        return text, toml_tables(text)
     except OSError as error:
         raise ConfigError(f"Cannot read {path}: {error.strerror}; check the path and its permissions.") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not a text file in UTF-8; name {what} in TOML, or save it in UTF-8.") from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise ConfigError(f"{path} is not valid TOML ({error}); correct it.") from error
-    except (ValueError, RecursionError) as error:
-        reason = "it is nested too deeply" if isinstance(error, RecursionError) else "it has too long an integer"
-        raise ConfigError(f"{path} is not valid TOML ({reason}); correct it.") from error
 
 
-__all__ = ["read_toml"]
+def toml_tables(text: str) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    Raises:
+        ValueError: it is not TOML, is nested too deeply, or has too long an integer.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    except ValueError as error:
+        raise ValueError("it has too long an integer") from error
+
+
+__all__ = ["read_toml", "toml_tables"]

@@ -199,6 +199,7 @@ def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_pat
         (("plan", "seed"), math.inf),
         (("plan", "seed"), 2**32),
         (("plan", "history"), 101),
+        (("plan", "prior_toml"), "x = " + "[" * 3000),
         (("plan", "updates"), 10**400),
     ],
 )
@@ -216,7 +217,11 @@ def test_resume_refuses_an_edited_campaign(
     assert "cannot be resumed (campaign.json: " in text
 
 
-@pytest.mark.parametrize("content", ["x = [", None])
+@pytest.mark.parametrize(
+    "content",
+    ["x = [", "x = " + "[" * 3000, "x = " + "9" * 5000, None],
+    ids=["cut", "nested", "long integer", "missing"],
+)
 def test_run_whose_car_is_unknown_is_not_resumed(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, content: str | None
 ) -> None:

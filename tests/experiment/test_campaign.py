@@ -25,7 +25,7 @@ from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import CarState, Reality
 from carlab.experiment.campaign import training
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
+from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign, saved_plan
 from carlab.experiment.campaign.figures import EpisodeFigures, predict_windows
 from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.report import learning_curve, restore_missing_rows, save_row, write_report
@@ -119,6 +119,7 @@ def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, 
         {"seed": 1.5},
         {"seed": 2**32},
         {"history": 101},
+        {"prior_toml": "x = " + "[" * 3000},
     ]
     invalid_plans = [json.dumps({**complete, "plan": {**complete["plan"], **change}}) for change in changes]
     for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}', *invalid_plans):
@@ -126,6 +127,8 @@ def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, 
             (invalid_run.path / "campaign.json").write_text(content)
         with pytest.raises(DataError, match="cannot be resumed"):
             resumed_campaign(invalid_run, choose_car("sim"), CampaignHooks())
+        with pytest.raises(DataError, match="is not the folder of a run of carlab learn"):
+            saved_plan(invalid_run.path)
 
 
 def test_learning_curve_has_the_figures_of_the_recordings(interrupted: InterruptedRun) -> None:

@@ -12,7 +12,6 @@ its next step.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.seeds import MAX_SEED
+from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.prior_correction import PriorVersion, corrected, without_ranges
 from carlab.experiment.campaign.prior_correction_process import (
@@ -237,7 +237,7 @@ class Campaign:
         return corrected(self._initial_prior(), version.corrections)
 
     def _initial_prior(self) -> SimulatorConfig:
-        return SimulatorConfig.from_tables(tomllib.loads(self.plan.prior_toml))
+        return SimulatorConfig.from_tables(toml_tables(self.plan.prior_toml))
 
     def _correct_prior(self) -> bool:
         """Correct the prior after the newest episode, unless that is done; False if it was stopped."""
@@ -308,7 +308,7 @@ def check_same_car(run: RunDirectory, choice: CarChoice, car_options: str) -> No
         return  # No campaign: ``resumed_campaign`` raises.
     try:
         texts = (run.config_toml, choice.config_toml)
-        tables = [{k: v for k, v in tomllib.loads(text).items() if k not in CONNECTION_TABLES} for text in texts]
+        tables = [{k: v for k, v in toml_tables(text).items() if k not in CONNECTION_TABLES} for text in texts]
     except (OSError, ValueError) as error:
         raise DataError(
             f"{run.path} cannot be resumed, because its car is unknown (config.toml: {error}); restore the file, or "
@@ -337,7 +337,7 @@ def saved_plan(folder: Path) -> TrainingPlan:
     """The plan of a run, without the file of a user's task. Raises DataError if the folder is not a campaign."""
     try:
         plan = plan_from_json(read_json(folder / CAMPAIGN_FILE)["plan"])
-        SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+        SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
         return plan
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
@@ -353,7 +353,7 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
         content = read_json(path)
         plan = plan_from_json(content["plan"])
         plan = plan if device is None else replace(plan, device=device)
-        SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+        SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
         tables = content.get("questioned")
         checked_simulator = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(

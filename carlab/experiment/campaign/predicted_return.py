@@ -7,13 +7,13 @@ learned car fits the recordings better, so the weight of the drawn cars falls wi
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import ACTION_SIZE, STATE_FEATURES
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.toml_files import toml_tables
 from sim_backends.car_parameters import SimulatorConfig
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def predicted_figures(
 
     totals = [learned.roll_out(agent.act).returns.numpy()]
     shares = [1.0]
-    prior = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+    prior = SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
     if plan.method == "gp-sim-posterior":
         cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed), plan.history)
         cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)

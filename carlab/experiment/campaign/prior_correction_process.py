@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.json_files import read_json
+from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.child_process import ChildError, run_in_child
 from carlab.experiment.campaign.prior_correction import (
     PARAMETERS,
@@ -74,7 +74,7 @@ def read_version(run: RunDirectory, episode: int) -> PriorVersion | None:
         return None
     try:
         return PriorVersion.from_dict(read_json(path, keep_infinite=True))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise DataError(f"{path} cannot be read ({error}); remove it, and the run repeats the correction.") from error
 
 
@@ -102,7 +102,7 @@ def correct_prior(request: CorrectionRequest) -> PriorVersion:
     """The next version of the prior. Raises CarlabError if a recording cannot be read."""
     from carlab.recording.mcap.source import has_ticks, read_episode
 
-    car = SimulatorConfig.from_tables(tomllib.loads(request.car_toml))
+    car = SimulatorConfig.from_tables(toml_tables(request.car_toml))
     episodes = [read_episode(path) for path in request.recordings if has_ticks(path)]
     number = len(request.recordings)
     check: dict[str, Any] = read_json(request.folder / CHECK_FILE, keep_infinite=True)

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 import logging
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.child_process import ChildError, run_in_child
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
@@ -79,7 +79,7 @@ def run_check_subprocess(
 
 
 def _check(run: Path, recordings: list[Path], simulator_toml: str) -> dict[str, Any]:
-    return check(run, recordings, SimulatorConfig.from_tables(tomllib.loads(simulator_toml)))
+    return check(run, recordings, SimulatorConfig.from_tables(toml_tables(simulator_toml)))
 
 
 def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import json
 import logging
 import os
 import shutil
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from carlab.core.observation import episode_features, feature_size
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.state_estimator import StateEstimator
+from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.figures_file import FIGURES_FILE, read_training_figures
 from carlab.experiment.campaign.predicted_return import predicted_figures
 from carlab.experiment.campaign.prior_correction_process import read_version
@@ -162,7 +162,7 @@ def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[Episode
 
 def _prior_model(plan: TrainingPlan, episodes: list[EpisodeData]) -> CarModel:
     """The prior simulator with the velocity delay of the recordings."""
-    simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+    simulator = SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
     return CarModel(simulator, plan.history, known_ranges(simulator), velocity_delay_s=velocity_delay_s(episodes))
 
 
@@ -181,7 +181,7 @@ def _environments(
     from learning.world import model_env
 
     task = plan.task
-    period_s = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml)).control_period_s
+    period_s = SimulatorConfig.from_tables(toml_tables(plan.prior_toml)).control_period_s
     slow_gate = replace(envelope, reaction_s=envelope.reaction_s + EXTRA_REACTION_S)
     gate: dict[str, Any] = {"envelope": slow_gate, "period_s": period_s, "device": plan.device}
     recorded = recorded_features(episodes, plan.history) if episodes else None
