@@ -205,7 +205,7 @@ def _predicted_figures(
     """``predicted_figures`` for the learned car with the safety gate of the driven car."""
     from learning.world.model_env import ModelEnv
 
-    period_s = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml)).control_period_s
+    period_s = SimulatorConfig.from_tables(toml_tables(plan.prior_toml)).control_period_s
     learned = ModelEnv(
         dynamics, plan.task, N_EVALUATION_CARS, envelope=envelope, period_s=period_s, seed=seed + 2, device=plan.device
     )
