@@ -19,7 +19,8 @@ def test_missing_ray_is_refused_before_the_run(carlab: Carlab, tmp_path: Path, m
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     code, text = carlab("learn", "--ray", "local", "--out", tmp_path / "runs", "--no-rerun")
     assert code == 2
-    assert "--ray needs Ray, which is not installed; run: pip install 'carlab[ray]'." in text
+    assert "--ray needs Ray, which is not installed; in the repository of carlab, run:" in text
+    assert "-e '.[ray]'." in text
     assert list((tmp_path / "runs").iterdir()) == []
 
 
