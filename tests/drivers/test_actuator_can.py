@@ -95,6 +95,7 @@ def test_drive_reaches_the_firmware_and_ends_in_neutral(interface: str, status_r
             actuator.command(MOVING)
             until(lambda: any(e.value == 3.0 for e in served.log.motor()))
             until(lambda: any(e.value == 0.65 for e in served.log.entries("servo")))
+            until(lambda: "battery_v" in actuator.health().readings)  # one of several status messages
             assert actuator.health().readings["battery_v"] == pytest.approx(11.1)
             t_s = time.monotonic()
             actuator.stop(planned=True)
