@@ -82,7 +82,8 @@ def drive(
 
     Raises:
         ConfigError, DataError: an argument is invalid, a file cannot be written, or this is not the main thread.
-        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control loop hung.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control
+            loop hung and could not end its episode.
     """
     from carlab.cars import choose_car
 

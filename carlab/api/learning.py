@@ -249,7 +249,7 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
         seed=request.seed if started is None else started,
     )
     results: list[EpisodeResult] = []
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as signals, contextlib.ExitStack() as stack:
         campaign = (_begun if request.resume is None else _resumed)(request, choice, hooks, stack)
         if connect is not None:
             settings = LiveSettings(campaign.run.path, request.episodes or campaign.episodes, True, connect)
@@ -258,7 +258,7 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
             campaign.trainer = stack.enter_context(_cluster_trainer(request, campaign, hooks))
         progress = _Progress(campaign.run, hooks)
         stack.enter_context(choice.car)
-        campaign.hooks = progress.campaign_hooks(stack.enter_context(Interrupts()))
+        campaign.hooks = progress.campaign_hooks(signals.enter_context(Interrupts()))  # until the car is closed
         if request.resume is None:
             campaign.write_plan()
         elif request.episodes is not None and request.episodes != campaign.episodes:

@@ -135,10 +135,11 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
         return Recording(path, imported.episodes, imported.announcement, imported.report, resolved)
     if mapping is not None or options:
         raise ConfigError(f"{path} is not a CSV; remove the mapping and its options.")
+    from carlab.recording.episode_builder import RECOVERY
     from carlab.recording.mcap.source import read_episode
 
     episode = read_episode(path)
-    recovery = episode.metadata.get("recovery", "")
+    recovery = episode.metadata.get(RECOVERY, "")
     return Recording(path, (episode,), is_recovered=bool(recovery), recovery=recovery)
 
 

@@ -54,7 +54,8 @@ class RunHooks:
         on_document: receives each document of the control loop; it must return at once.
         on_result: receives each finished episode.
         on_abandon: receives reason and detail after the control loop hung and the car was stopped; it may end the
-            process. Otherwise SafetyStop is raised if the loop resumes.
+            process. Otherwise, if the loop resumes, the episode ends with LOOP_HUNG, or SafetyStop is raised if the
+            loop itself fails because the car is closed.
     """
 
     on_start: Callable[[Path, Car], None] = lambda folder, car: None
@@ -237,8 +238,8 @@ def collecting(hooks: RunHooks, run: RunDirectory, results: list[EpisodeResult])
     """The hooks; each finished episode is also appended to ``results`` and to result.json."""
 
     def on_result(result: EpisodeResult) -> None:
+        write_result(run, [*results, result])
         results.append(result)
-        write_result(run, results)
         hooks.on_result(result)
 
     return replace(hooks, on_result=on_result)

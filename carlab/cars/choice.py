@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from carlab.cars.car_file import CarFile, default_car, is_preset, load_car_file
@@ -17,6 +17,8 @@ from drivers.config import ActuatorConfig
 from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 PLUGIN_GROUP = "carlab.cars"
+WATCHDOG_PERIODS = 2.0
+"""Minimum ratio of the watchdog to the control period, and of the latch to the watchdog, of a car without hardware."""
 
 
 @dataclass(slots=True)
@@ -51,6 +53,7 @@ def choose_car(
     dry_run: bool = False,
     seed: int = 0,
     log_folder: Path | None = None,
+    is_driven: bool = True,
 ) -> CarChoice:
     """Build the car of ``--car`` without opening it.
 
@@ -64,12 +67,14 @@ def choose_car(
         dry_run: discard commands.
         seed: of the sensors' noise.
         log_folder: where an emulated car writes its log.
+        is_driven: whether commands are sent to the car; a simulator that only predicts has no watchdog.
 
     Raises:
         ConfigError: unknown car, an error in its file, or a control period that its watchdog does not permit.
     """
     choice = _choose(name, vehicle, reality, seed)
-    _check_watchdog(choice)
+    if is_driven:
+        _check_watchdog(choice)
     if log_folder is not None:
         choice.log_to(log_folder)
     if dry_run:
@@ -199,8 +204,15 @@ def _real(file: CarFile, seed: int) -> CarChoice:
 
 
 def _actuator(file: CarFile) -> ActuatorConfig:
-    """The actuator of the real car, whose deadlines its simulation and emulation share; the default one without it."""
-    return ActuatorConfig() if file.real is None else file.real.hardware.actuator
+    """The actuator of the real car, whose deadlines its simulation and emulation share.
+
+    Without a real car the default one, with deadlines longer than the control period.
+    """
+    if file.real is not None:
+        return file.real.hardware.actuator
+    default, period_s = ActuatorConfig(), file.simulator.control_period_s
+    watchdog_s = max(default.watchdog_s, WATCHDOG_PERIODS * period_s)
+    return replace(default, watchdog_s=watchdog_s, latch_s=max(default.latch_s, WATCHDOG_PERIODS * watchdog_s))
 
 
 def _envelope(file: CarFile) -> SafetyEnvelope:

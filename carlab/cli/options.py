@@ -41,12 +41,12 @@ class CarOptions:
         """These options as command-line text, each with a leading space; default values are omitted."""
         return car_options_text(**self.arguments())
 
-    def choose(self, *, seed: int, log_folder: Path | None = None) -> CarChoice:
-        """Build the car without opening it."""
+    def choose(self, *, seed: int, log_folder: Path | None = None, is_driven: bool = True) -> CarChoice:
+        """Build the car without opening it; ``is_driven`` as for ``choose_car``."""
         from carlab.cars import choose_car
 
         given = self.arguments()
-        return choose_car(given.pop("car"), **given, seed=seed, log_folder=log_folder)
+        return choose_car(given.pop("car"), **given, seed=seed, log_folder=log_folder, is_driven=is_driven)
 
 
 @dataclass

@@ -81,7 +81,7 @@ class Replay:
         valid_seed(seed=self.seed)
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
-        simulated = self.car.choose(seed=self.seed).car.reality is Reality.SIMULATED
+        simulated = self.car.choose(seed=self.seed, is_driven=False).car.reality is Reality.SIMULATED
         if not simulated or self.drive:
             for option in ("adapt", "save"):
                 if getattr(self, option):

@@ -19,6 +19,8 @@ VELOCITY_DELAY = "velocity_delay_s"
 LATE = "late_s"
 POLICY_TIME = "policy_s"
 TRACKED = "tracked"
+RECOVERED, RECOVERY = "recovered", "recovery"
+"""Metadata of an episode from an unfinished or damaged file: "true", and a sentence."""
 Row = tuple[float, int, Observation]
 """Time [s] of an observation, the step that starts with it, and the observation."""
 OWN_COLUMNS = (POSE_AGE, VELOCITY_DELAY, LATE, POLICY_TIME, TRACKED)
@@ -194,7 +196,8 @@ def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
     texts = episode.metadata
     known = _started_texts(EpisodeStarted(0, 0.0, 0, "", Reality.REAL, "", "", 0, 0.0, 0))
     known |= _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
-    period_s = float(texts.get("period_s", episode.period_s))
+    written = {*known, RECOVERED, RECOVERY}  # a copy of a damaged recording is not damaged
+    period_s, prefix = float(texts.get("period_s", episode.period_s)), "statistics."
     return EpisodeStarted(
         episode=int(texts.get("episode", 1)),
         t_s=float(texts.get("start_t_s", episode.times_s[0])),
@@ -210,7 +213,7 @@ def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
         arena_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "arena_m")),
         path_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "path_m")),
         config_toml=texts.get("config_toml", ""),
-        metadata={k: v for k, v in texts.items() if k not in known and not k.startswith("statistics.")},
+        metadata={k: v for k, v in texts.items() if k not in written and not k.startswith(prefix)},
     )
 
 

@@ -1,8 +1,8 @@
 """An exclusive lock on one motor controller of a bus, so that two programs cannot command it.
 
 A CAN bus accepts any number of senders. Two programs that send to one motor controller alternate between the commands
-of both, and neither can see it. The lock is a file in the system's folder for temporary files, locked by ``flock``: it
-also excludes programs of other users, and the kernel releases it when its process ends for any reason.
+of both, and neither can see it. The lock is a file in the folder for temporary files, locked by ``flock``: it also
+excludes programs of other users with the same folder, and the kernel releases it when its process ends for any reason.
 """
 
 from __future__ import annotations
@@ -101,5 +101,5 @@ class BusLock:
     def _impossible(self, reason: str) -> NotReadyError:
         return NotReadyError(
             f"{self.what} cannot be locked",
-            (f"the lock file {self.path} cannot be opened ({reason}); set TMPDIR to a folder that you can write to.",),
+            (f"the lock file {self.path} cannot be opened ({reason}); make the file or its folder writable.",),
         )

@@ -15,8 +15,9 @@ from carlab.core.safety import SafeCar, SafetyEnvelope
 from sim_backends.simulated_car import SimulatedCar
 
 HARDWARE = "[hardware.arena]\ncorners_m = [[-9, -9], [9, -9], [9, 9], [-9, 9]]\n"
-LONG_WATCHDOG = "[hardware.actuator]\nwatchdog_s = 1.5\nlatch_s = 2.0\n"
-ENVELOPE = SafetyEnvelope(steering_rate_per_s=1000.0, throttle_rate_per_s=1000.0)
+TELEMETRY = "telemetry_stale_s = 1.9\ntelemetry_lost_s = 2.0\n"
+LONG_WATCHDOG = f"[hardware.actuator]\nwatchdog_s = 1.5\nlatch_s = 2.0\n{TELEMETRY}"
+ENVELOPE = SafetyEnvelope(steering_rate_per_s=1000.0, throttle_rate_per_s=1000.0, stale_pose_s=1.9, lost_pose_s=2.0)
 
 
 def car_file(folder: Path, control_period_s: float, hardware: str = "") -> Path:
@@ -26,11 +27,11 @@ def car_file(folder: Path, control_period_s: float, hardware: str = "") -> Path:
 
 
 @pytest.mark.parametrize("dry_run", [False, True])
-@pytest.mark.parametrize("car", ["sim", "emulated", "emulated-can", "file", "real file"])
+@pytest.mark.parametrize("car", ["sim", "emulated", "emulated-can", "real file"])
 def test_period_that_is_not_shorter_than_the_watchdog_is_refused(tmp_path: Path, car: str, dry_run: bool) -> None:
     def choose(control_period_s: float, hardware: str = "") -> float:
-        path = car_file(tmp_path, control_period_s, HARDWARE * (car == "real file" or bool(hardware)) + hardware)
-        if car.endswith("file"):
+        path = car_file(tmp_path, control_period_s, HARDWARE + hardware)
+        if car == "real file":
             return choose_car(str(path), dry_run=dry_run).control_period_s
         return choose_car(car, vehicle=path, dry_run=dry_run).control_period_s
 
@@ -41,6 +42,19 @@ def test_period_that_is_not_shorter_than_the_watchdog_is_refused(tmp_path: Path,
     assert choose(0.2, LONG_WATCHDOG) == 0.2
     with pytest.raises(ConfigError, match=r"below 1\.5 s"):
         choose(1.5, LONG_WATCHDOG)
+
+
+@pytest.mark.parametrize("car", ["sim", "emulated", "emulated-can", "file"])
+def test_watchdog_of_a_car_without_hardware_is_longer_than_its_period(tmp_path: Path, car: str) -> None:
+    path = car_file(tmp_path, 0.4)
+    choice = choose_car(str(path)) if car == "file" else choose_car(car, vehicle=path)
+    assert choice.watchdog_s is not None
+    assert choice.watchdog_s > choice.control_period_s == 0.4
+
+
+def test_car_that_is_not_driven_may_have_any_period(tmp_path: Path) -> None:
+    path = car_file(tmp_path, 0.2, HARDWARE)
+    assert choose_car("sim", vehicle=path, is_driven=False).control_period_s == 0.2
 
 
 def motor_values(car: EmulatedCar, since_s: float) -> list[float]:
@@ -79,7 +93,7 @@ def test_simulated_car_holds_a_command_as_long_as_its_car_file_states(tmp_path: 
 
 def test_command_that_the_watchdog_replaced_is_reported(tmp_path: Path) -> None:
     events: list[SafetyEvent] = []
-    path = car_file(tmp_path, 0.03, HARDWARE + "[hardware.actuator]\nlatch_s = 2.0\n")
+    path = car_file(tmp_path, 0.03, HARDWARE + "[hardware.actuator]\nlatch_s = 2.0\n" + TELEMETRY)
     with choose_car("emulated", vehicle=path).car as car:
         assert isinstance(car, EmulatedCar)
         car.place(CarState())
@@ -92,5 +106,5 @@ def test_command_that_the_watchdog_replaced_is_reported(tmp_path: Path) -> None:
         values = motor_values(car, t_s)
         first = values.index(2.0)
         assert 0.0 in values[first:], "the firmware has received neutral between two equal commands"
-        assert [event.kind for event in events] == ["watchdog"]
+        assert "watchdog" in [event.kind for event in events]
         safe.stop(planned=True)

@@ -63,7 +63,7 @@ def executor(monkeypatch: pytest.MonkeyPatch) -> FakeExecutor:
 
 @pytest.fixture(scope="module")
 def cluster() -> Any:
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     from carlab.jobs.ray_executor import RayExecutor
 
     with RayExecutor("local") as executor:

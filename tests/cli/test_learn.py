@@ -337,7 +337,7 @@ def test_training_on_ray_gives_the_run_without_ray(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
 ) -> None:
     """The same seed gives the same policies and drives; the second training starts from the first one's files."""
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     code, text = carlab("learn", "--ray", "local", "--car", "sim", "--episodes", 2, "--out", tmp_path, *TINY)
     assert code == 0, text
     (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())

@@ -49,13 +49,18 @@ class ArmSpeedCar(SimulatedCar):
 
 
 def make_session(
-    car: SimulatedCar, policy: Any, folder: Path, hooks: SessionHooks | None = None, **options: Any
+    car: SimulatedCar,
+    policy: Any,
+    folder: Path,
+    hooks: SessionHooks | None = None,
+    envelope: SafetyEnvelope | None = None,
+    **options: Any,
 ) -> Session:
     return Session(
         car,
         policy,
         ParkingTask(),
-        SafetyEnvelope(),
+        SafetyEnvelope() if envelope is None else envelope,
         RunDirectory.create(folder, "test"),
         1 / 30,
         hooks=SessionHooks() if hooks is None else hooks,
@@ -200,7 +205,8 @@ def test_loop_that_resumes_after_the_car_was_closed_raises_where_it_hung(tmp_pat
 
     with SimulatedCar(clock=MonotonicClock()) as car:
         hooks = SessionHooks(on_abandon=lambda reason, detail: abandoned.set())
-        session = make_session(car, HangingPolicy(), tmp_path, hooks, hang_timeout_s=0.4)
+        slow_guard = SafetyEnvelope(lost_pose_s=2.0)  # on a busy machine, the pose is older than 0.5 s after the hang
+        session = make_session(car, HangingPolicy(), tmp_path, hooks, hang_timeout_s=0.4, envelope=slow_guard)
         with pytest.raises(SafetyStop, match="The loop hung while inside the policy 'forward'") as raised:
             session.drive(2)
     assert raised.value.reason is EndReason.LOOP_HUNG

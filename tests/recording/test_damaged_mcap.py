@@ -95,6 +95,15 @@ def test_truncated_recording_is_not_called_unfinished(path):
     assert read_episode(unfinished).metadata["recovery"].startswith("was never finished; ")
 
 
+def test_saved_copy_of_a_damaged_recording_is_not_damaged(path, tmp_path):
+    path.write_bytes(path.read_bytes()[:-5000])
+    damaged = load(path)
+    assert damaged.is_recovered
+    copy = tmp_path / "copy.mcap"
+    damaged.save(copy)
+    assert not load(copy).is_recovered
+
+
 def test_recording_without_a_readable_tick_names_the_damage(path):
     start = chunks_of(path)[0][0]
     content = path.read_bytes()

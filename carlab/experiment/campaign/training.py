@@ -20,6 +20,7 @@ from carlab.core.errors import DataError, DivergedError
 from carlab.core.observation import episode_features, feature_size
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.safety_bounds import SAFETY_BOUNDS
 from carlab.core.state_estimator import StateEstimator
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.figures_file import FIGURES_FILE, read_training_figures
@@ -182,7 +183,8 @@ def _environments(
 
     task = plan.task
     period_s = SimulatorConfig.from_tables(toml_tables(plan.prior_toml)).control_period_s
-    slow_gate = replace(envelope, reaction_s=envelope.reaction_s + EXTRA_REACTION_S)
+    reaction_s = min(envelope.reaction_s + EXTRA_REACTION_S, SAFETY_BOUNDS.deadline.high)
+    slow_gate = replace(envelope, reaction_s=reaction_s)
     gate: dict[str, Any] = {"envelope": slow_gate, "period_s": period_s, "device": plan.device}
     recorded = recorded_features(episodes, plan.history) if episodes else None
 

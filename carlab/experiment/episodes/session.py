@@ -88,7 +88,7 @@ class SessionHooks:
     ``on_tick`` receives each tick, for a progress bar. ``on_document`` receives each document in the control loop, and
     returns at once. ``stop_reason`` may end an episode (dead-man control).
     ``on_abandon`` is called last if the loop hung, with reason and detail; it may end the process. Otherwise, if the
-    loop resumes, the session raises SafetyStop with them.
+    loop resumes, the episode ends with LOOP_HUNG, or the session raises SafetyStop with them if the loop fails.
     """
 
     place_by_hand: Callable[[CarState], None] = lambda start: None

@@ -46,12 +46,15 @@ def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -
         except RefusedError as refusal:
             if mapping is None:
                 mapping = recognise_layout(read_csv(path).header, Path(path).name)
+            before = mapping
             for finding in refusal.findings:
                 repaired_mapping = None if finding.option is None else _with_option(mapping, finding.option)
-                if repaired_mapping is None or repaired_mapping == mapping:
+                if repaired_mapping is None:
                     raise
                 mapping = repaired_mapping
                 repaired.append(finding)
+            if mapping == before:
+                raise
     raise DataError(f"{path} has too many faults for the automatic repair; import it with carlab import.")
 
 

@@ -15,7 +15,7 @@ from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import Action, Observation, PoseSample
-from carlab.recording.episode_builder import episode_from_documents
+from carlab.recording.episode_builder import RECOVERED, RECOVERY, episode_from_documents
 from carlab.recording.mcap import messages as messages
 from carlab.recording.mcap import schemas as schemas
 from carlab.recording.mcap.damage import MAGIC, NEVER_FINISHED, FileDefect, read_records
@@ -63,7 +63,7 @@ def read_episode(path: Path | str) -> EpisodeData:
         raise DataError(str(error).replace("The recording", str(recording.path), 1)) from error
     if recording.defect is None:
         return episode
-    recovery = {"recovered": "true", "recovery": recording.defect.sentence(episode.ticks)}
+    recovery = {RECOVERED: "true", RECOVERY: recording.defect.sentence(episode.ticks)}
     return dataclasses.replace(episode, metadata={**episode.metadata, **recovery})
 
 
