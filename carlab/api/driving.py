@@ -82,8 +82,7 @@ def drive(
 
     Raises:
         ConfigError, DataError: an argument is invalid, a file cannot be written, or this is not the main thread.
-        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control
-            loop hung and could not end its episode.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control loop hung.
     """
     from carlab.cars import choose_car
 

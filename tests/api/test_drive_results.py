@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,15 @@ def signalling(call: Callable[..., Any]) -> Callable[..., Any]:
     return call_after_signal
 
 
+@pytest.fixture
+def interrupts_raise() -> Iterator[None]:
+    """^C raises KeyboardInterrupt, although a shell ignores it for programs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interrupts_raise")
 @pytest.mark.parametrize("second", ["carlab.recording.save_summary", "sim_backends.simulated_car.SimulatedCar.close"])
 def test_second_interrupt_after_the_drive_loses_no_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: str
