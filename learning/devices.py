@@ -16,8 +16,8 @@ from torch import Tensor
 from carlab.core.errors import ConfigError
 
 DeviceName = Literal["cpu", "cuda"]
-CALLS_BEFORE_RECORDING = 3
-"""Calls of a function before its operations are recorded: the libraries of CUDA allocate their memory in them."""
+CALLS_BEFORE_CAPTURE = 3
+"""Calls of a function before its operations are captured: the libraries of CUDA allocate their memory in them."""
 
 
 def available(name: str) -> str:
@@ -44,8 +44,8 @@ def synchronise(device: torch.device | str) -> None:
         torch.cuda.synchronize()
 
 
-def records_functions(device: torch.device | str) -> bool:
-    """Whether the operations of a function can be recorded on a device."""
+def can_capture(device: torch.device | str) -> bool:
+    """Whether the operations of a function can be captured as a CUDA graph on a device."""
     return torch.device(device).type == "cuda" and torch.cuda.device_count() > 0
 
 
@@ -63,8 +63,8 @@ def denormals_flushed() -> Iterator[None]:
         torch.set_flush_denormal(was)
 
 
-class RecordedFunction:
-    """A function of CUDA tensors, recorded as a CUDA graph and replayed.
+class CapturedFunction:
+    """A function of CUDA tensors, captured as a CUDA graph and replayed.
 
     A replay starts all operations with one launch. For small tensors, one launch for each operation takes most of the
     time of a call. The function may change tensors in place, but must not depend on numbers that change between calls
@@ -84,10 +84,10 @@ class RecordedFunction:
     def __call__(self, *inputs: Tensor) -> dict[str, Tensor]:
         """Outputs of the function; the next call overwrites them."""
         self._calls += 1
-        if self._calls <= CALLS_BEFORE_RECORDING:
+        if self._calls <= CALLS_BEFORE_CAPTURE:
             return self._on_another_stream(inputs)
         if self._graph is None:
-            self._record(inputs)
+            self._capture(inputs)
         assert self._graph is not None
         for own, given in zip(self._inputs, inputs, strict=True):
             own.copy_(given)
@@ -95,7 +95,7 @@ class RecordedFunction:
         return self._outputs
 
     def _on_another_stream(self, inputs: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Call the function on another stream than the default one, which cannot be recorded."""
+        """Call the function on another stream than the default one, on which nothing can be captured."""
         stream, current = torch.cuda.Stream(), torch.cuda.current_stream()  # type: ignore[no-untyped-call]
         stream.wait_stream(current)
         with torch.cuda.stream(stream):
@@ -103,8 +103,8 @@ class RecordedFunction:
         current.wait_stream(stream)
         return outputs
 
-    def _record(self, inputs: tuple[Tensor, ...]) -> None:
-        """Record the operations, without running them."""
+    def _capture(self, inputs: tuple[Tensor, ...]) -> None:
+        """Capture the operations, without running them."""
         graph = torch.cuda.CUDAGraph()
         self._inputs = [v.clone() for v in inputs]
         with torch.cuda.graph(graph):
@@ -113,11 +113,11 @@ class RecordedFunction:
 
 
 __all__ = [
+    "CapturedFunction",
     "DeviceName",
-    "RecordedFunction",
     "available",
+    "can_capture",
     "denormals_flushed",
     "device_name",
-    "records_functions",
     "synchronise",
 ]

@@ -84,7 +84,7 @@ def device(
         if vars(module).get("get_device") is sb3_get_device:
             monkeypatch.setattr(module, "get_device", torch.device)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)  # The stand-in records no functions.
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)  # Nothing can be captured on the stand-in.
     with stand_in_device.stand_in() as operations:
         yield "cuda"
     assert stand_in_device.without_cuda(operations.used) == []

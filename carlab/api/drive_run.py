@@ -64,7 +64,7 @@ class DriveRun:
 
 
 @contextlib.contextmanager
-def results_kept(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResult]]:
+def run_results(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResult]]:
     """A list for the results of a run; finally their picture is drawn if ``picture``.
 
     An error within the context gets a sentence with the run's folder if episodes were finished before it.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import above_zero, at_least, valid_seed
-from carlab.api.drive_run import DriveRun, results_kept
+from carlab.api.drive_run import DriveRun, run_results
 from carlab.api.runs import (
     RunHooks,
     collecting,
@@ -99,7 +99,7 @@ def drive(
 
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
-        with results_kept(run, picture) as results:
+        with run_results(run, picture) as results:
             hooks = collecting(hooks, run, results)
             _drive(choice, driver, chosen_task, max_throttle, run, episodes, hooks, options)
     return DriveRun(run.path, tuple(results))

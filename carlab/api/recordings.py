@@ -152,7 +152,10 @@ def required_file(path: Path, what: str = "The recording") -> Path:
 
         unfinished = partial_path(path)
         if path.suffix == ".mcap" and unfinished.is_file():
-            raise ConfigError(f"{what} '{path}' was never finished; name '{unfinished}', whose ticks can be read.")
+            raise ConfigError(
+                f"{what} '{path}' does not exist, because its writer was stopped; name '{unfinished}', whose ticks can "
+                "be read."
+            )
         raise ConfigError(f"{what} '{path}' does not exist; check the path.")
     if path.is_dir():
         raise ConfigError(f"{what} '{path}' is a folder; name a file in it (a run has episodes/0001.mcap).")

@@ -28,9 +28,9 @@ class PoseSource(Protocol):
         """Rates, losses and latencies; the names end in their units."""
 
     def problems(self) -> tuple[str, ...]:
-        """Reasons not to trust the poses that arrive (a wrong axis, invalid poses ...), as sentences with remedies.
+        """Reasons why the poses may be wrong (a wrong axis, invalid poses ...), as sentences with remedies.
 
-        Empty if there are none. Never blocks.
+        Empty without a reason. Does not block.
         """
 
     def close(self) -> None:

@@ -19,6 +19,8 @@ VELOCITY_DELAY = "velocity_delay_s"
 LATE = "late_s"
 POLICY_TIME = "policy_s"
 TRACKED = "tracked"
+STATISTICS = "statistics."
+"""Prefix of the names of statistics in the metadata."""
 RECOVERED, RECOVERY = "recovered", "recovery"
 """Metadata of an episode from an unfinished or damaged file: "true", and a sentence."""
 Row = tuple[float, int, Observation]
@@ -179,7 +181,6 @@ def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
             total_reward += reward
             arrival_s = float(episode.times_s[k + 1])
             yield Transition(k, arrival_s, nothing, sent, reward, nothing, terminated=False, truncated=False)
-    prefix = "statistics."
     yield EpisodeEnded(
         t_s=float(episode.times_s[-1]),
         reason=EndReason[texts.get("end_reason", EndReason.COMPLETED.name)],
@@ -187,7 +188,7 @@ def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
         steps=episode.ticks,
         total_reward=float(texts.get("total_reward", total_reward)),
         last=seen[-1],
-        statistics={k.removeprefix(prefix): float(v) for k, v in texts.items() if k.startswith(prefix)},
+        statistics={k.removeprefix(STATISTICS): float(v) for k, v in texts.items() if k.startswith(STATISTICS)},
     )
 
 
@@ -197,7 +198,7 @@ def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
     known = _started_texts(EpisodeStarted(0, 0.0, 0, "", Reality.REAL, "", "", 0, 0.0, 0))
     known |= _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
     written = {*known, RECOVERED, RECOVERY}  # a copy of a damaged recording is not damaged
-    period_s, prefix = float(texts.get("period_s", episode.period_s)), "statistics."
+    period_s = float(texts.get("period_s", episode.period_s))
     return EpisodeStarted(
         episode=int(texts.get("episode", 1)),
         t_s=float(texts.get("start_t_s", episode.times_s[0])),
@@ -213,7 +214,7 @@ def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
         arena_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "arena_m")),
         path_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "path_m")),
         config_toml=texts.get("config_toml", ""),
-        metadata={k: v for k, v in texts.items() if k not in written and not k.startswith(prefix)},
+        metadata={k: v for k, v in texts.items() if k not in written and not k.startswith(STATISTICS)},
     )
 
 

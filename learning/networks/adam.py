@@ -45,7 +45,7 @@ class Adam:
     def step(self, gradient: Tensor, rate: float | Tensor) -> None:
         """Move the parameters against their gradient, a tensor of the same shape, by the learning rate ``rate``.
 
-        A rate in a CUDA tensor () may change between replays of a recorded step.
+        A rate in a CUDA tensor () may change between replays of a captured step.
         """
         self._steps += 1.0
         torch._fused_adamw_(

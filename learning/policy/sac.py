@@ -23,7 +23,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 from torch import Tensor, nn
 
 from carlab.core.errors import ConfigError
-from learning.devices import RecordedFunction, denormals_flushed, records_functions
+from learning.devices import CapturedFunction, can_capture, denormals_flushed
 from learning.networks.adam import Adam
 from learning.networks.array_file import checked_tensor, whole_number
 from learning.networks.particles import Layers, Network, Pullback
@@ -89,7 +89,7 @@ class FastSac(SAC):
         self._critics = _stacked([[[m] for m in _linear(q)] for q in policy.critic.q_networks])
         self._targets = _stacked([[[m] for m in _linear(q)] for q in policy.critic_target.q_networks])
         self._temperature = Adam(self.log_ent_coef.detach())
-        self._recorded: dict[tuple[float, int], RecordedFunction] = {}
+        self._captured: dict[tuple[float, int], CapturedFunction] = {}
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Do gradient steps on batches of the replay buffer."""
@@ -106,7 +106,7 @@ class FastSac(SAC):
             observations = torch.cat(list(pair), dim=1)
             state_actions = torch.cat([rows.observations, rows.actions], dim=1)
             fields = (torch.split(f, batch_size) for f in (state_actions, discount, rows.rewards))
-            gradient_step = self._recorded_step(rate, batch_size) if records_functions(self.device) else None
+            gradient_step = self._captured_step(rate, batch_size) if can_capture(self.device) else None
             figures: dict[str, Tensor] = {}
             for step, batch in enumerate(zip(observations, *fields, noise, noise_nll, strict=True)):
                 if gradient_step is not None:
@@ -168,13 +168,13 @@ class FastSac(SAC):
     def _adams(self) -> dict[str, Adam]:
         return {"actor": self._actor.adam, "critics": self._critics.adam, "temperature": self._temperature}
 
-    def _recorded_step(self, rate: float, batch_size: int) -> RecordedFunction:
-        """The gradient step with its figures, as a recorded function of the fields of a batch."""
+    def _captured_step(self, rate: float, batch_size: int) -> CapturedFunction:
+        """The gradient step with its figures, as a captured function of the fields of a batch."""
 
         def gradient_step(*batch: Tensor) -> dict[str, Tensor]:
             return self._gradient_step(_Batch(*batch), rate, last=True)
 
-        return self._recorded.setdefault((rate, batch_size), RecordedFunction(gradient_step))
+        return self._captured.setdefault((rate, batch_size), CapturedFunction(gradient_step))
 
     def _gradient_step(self, batch: _Batch, rate: float, *, last: bool) -> dict[str, Tensor]:
         """One step of temperature, critics and actor; returns temperature and losses of the ``last`` step."""

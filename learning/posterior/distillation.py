@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
-from learning.devices import RecordedFunction, records_functions
+from learning.devices import CapturedFunction, can_capture
 from learning.networks.adam import Adam
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
@@ -181,7 +181,7 @@ def _train(
         return {}
 
     rates = [_rate(step, settings) for step in range(settings.steps)]
-    replayed = RecordedFunction(train_step) if records_functions(parameters.device) else None
+    replayed = CapturedFunction(train_step) if can_capture(parameters.device) else None
     device_rates = torch.tensor(rates).to(parameters.device)
     for step, sets in enumerate(order.to(parameters.device)):
         if replayed is None:

@@ -269,7 +269,7 @@ def test_unfinished_recording_is_named_by_import_and_view(carlab: Carlab, tmp_pa
     for options in (("view",), ("replay",), ("export", "--out", tmp_path / "table.csv")):
         code, text = carlab(*options, tmp_path / "drive.mcap")
         assert code == 2
-        assert f"was never finished; name '{unfinished}'" in text
+        assert f"does not exist, because its writer was stopped; name '{unfinished}'" in text
     code, text = carlab("export", unfinished, "--out", tmp_path / "drive_again.csv")
     assert code == 0, text
 

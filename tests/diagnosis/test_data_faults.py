@@ -391,23 +391,6 @@ class TestRepairedImport:
         np.testing.assert_allclose(np.cos(episode.states[:, YAW]), np.cos(clean.states[keep, YAW]), atol=1e-6)
         assert np.ptp(episode.extra["segment"]) == 1
 
-    @pytest.mark.parametrize("cells", [{"steering": ("", "1e30")}, {"steering": ("",), "yaw": ("",)}])
-    def test_import_drops_rows_with_missing_and_with_too_large_cells(self, clean, tmp_path, cells):
-        """Several faults have one remedy, which is applied once."""
-        path = tmp_path / "drive.csv"
-        write_csv(clean, path)
-        header, *lines = path.read_text(encoding="utf-8").splitlines()
-        names, rows = header.split(","), [line.split(",") for line in lines]
-        row = 100
-        for name, values in cells.items():
-            for value in values:
-                rows[row][names.index(name)] = value
-                row += 50
-        path.write_text("\n".join([header, *(",".join(r) for r in rows)]) + "\n", encoding="utf-8")
-        read = import_repaired(path)
-        assert {f.id for f in read.repaired} >= {"not_a_number"}
-        assert len(read.imported.episode.times_s) == len(rows) - 2
-
     def test_what_has_no_safe_remedy_is_refused_as_before(self, clean, tmp_path):
         write_csv(with_sent(clean, lambda sent: np.multiply(sent, 30.0, out=sent)), tmp_path / "drive.csv")
         with pytest.raises(DataError, match="say what full command is"):

@@ -26,7 +26,7 @@ from carlab.core.task import ObstacleParkingTask
 from carlab.studies.regression.methods import METHODS
 from carlab.studies.regression.study import run_study
 from learning.baselines import system_identification
-from learning.devices import RecordedFunction, synchronise
+from learning.devices import synchronise
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.functional_svgd.authors_fsvgd import fit_authors_fsvgd
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
@@ -118,29 +118,6 @@ def test_operations_without_a_cuda_kernel_are_listed(stand_in_device: ModuleType
     """torch's operator list decides which operations of the stand-in CUDA supports."""
     known = ("mul.Tensor", "add.Tensor", "linalg_cholesky_ex", "cov", "mkldnn_linear")
     assert stand_in_device.without_cuda(known) == ["mkldnn_linear"]
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_recorded_function_has_the_results_of_its_calls() -> None:
-    """A recorded step with a state and a changing rate equals the same steps without a recording."""
-    generator = torch.Generator().manual_seed(0)
-    inputs = torch.randn((12, 8), generator=generator).cuda()
-    rates = torch.linspace(0.1, 0.5, 12).cuda()
-
-    def steps(recorded: bool) -> tuple[Tensor, Tensor]:
-        state = torch.zeros(8, device="cuda")
-
-        def step(row: Tensor, rate: Tensor) -> dict[str, Tensor]:
-            state.add_(rate * (row - state).tanh())
-            return {"distance": (row - state).norm()}
-
-        call = RecordedFunction(step) if recorded else step
-        distances = [call(row, rate)["distance"].clone() for row, rate in zip(inputs, rates, strict=True)]
-        return state, torch.stack(distances)
-
-    for found, expected in zip(steps(True), steps(False), strict=True):
-        torch.testing.assert_close(found, expected)
 
 
 def test_transfer_between_devices_copies(device: str) -> None:

@@ -92,7 +92,7 @@ def test_truncated_recording_is_not_called_unfinished(path):
     assert recovery.startswith(f"ends at byte {len(content) - 5000} before its closing record (it was not copied")
     assert recovery.endswith("complete ticks were recovered; copy it again")
     unfinished = path.rename(path.with_name("0001.mcap.partial"))
-    assert read_episode(unfinished).metadata["recovery"].startswith("was never finished; ")
+    assert read_episode(unfinished).metadata["recovery"].startswith("is incomplete, because its writer was stopped; ")
 
 
 def test_saved_copy_of_a_damaged_recording_is_not_damaged(path, tmp_path):

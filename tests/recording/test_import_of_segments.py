@@ -33,7 +33,7 @@ def test_column_of_the_file_gets_another_name(with_gap, tmp_path):
     np.testing.assert_array_equal(imported.episode.extra["segment_of_file"], LAPS)
     np.testing.assert_array_equal(imported.episode.extra["segment"], np.repeat([0.0, 1.0], [400, 470]))
     (finding,) = imported.report.of("renamed_column", "segment")
-    assert "kept as 'segment_of_file'" in finding.sentence
+    assert "renamed 'segment_of_file'" in finding.sentence
     first, second = import_csv(path, mapping=SPLIT).episodes
     np.testing.assert_array_equal(first.extra["segment_of_file"], LAPS[:400])
     np.testing.assert_array_equal(second.extra["segment_of_file"], LAPS[400:])

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+MODEL_ERROR_SHARE = 0.1
+"""Standard deviation of a size due to the error of the model, as a share of the size: a wrong model predicts the
+influence of a change with a relative error, about 0.1 for sizes of correctly named changes of a real car."""
+
 
 @dataclass(frozen=True, slots=True)
 class ComparisonSettings:
@@ -62,9 +66,8 @@ class ComparisonSettings:
     """Minimum likelihood ratio of a further change, as a share of that of the first: a weak one imitates the first."""
     max_changes: int = 3
     """Maximum number of changes."""
-    model_error_share: float = 0.1
-    """Standard deviation of a size due to the error of the model, as a share of the size: a wrong model predicts the
-    influence of a change with a relative error, about 0.1 for sizes of correctly named changes of a real car."""
+    model_error_share: float = MODEL_ERROR_SHARE
+    """Standard deviation of a change due to the error of the model, as a share of the change."""
     tie_z: float = 2.0
     """Two candidates are indistinguishable if their losses on the second group differ by less [standard errors]."""
     period_ratio_max: float = 1.2

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from carlab.diagnosis.settings.comparison import MODEL_ERROR_SHARE
+
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSettings:
@@ -25,10 +27,9 @@ class EvidenceSettings:
     joint_min_relative_std: float = 0.002
     """The same for joint fits of parameters and initial states, whose errors are a third as large
     (docs/decisions/0023)."""
-    model_error_share: float = 0.1
+    model_error_share: float = MODEL_ERROR_SHARE
     """Standard deviation of an effect's number due to the error of the model, as a share of its distance from the
-    identity or from the car file: a wrong model predicts the influence of an effect with a relative error. It counts
-    as far as the held-out error exceeds the noise. The value is that of the comparison (``ComparisonSettings``)."""
+    identity or from the car file, as far as the held-out error exceeds the noise."""
     identity_distance_min: float = 1.6449
     """An effect is withdrawn if its numbers in a joint fit differ from their identities, or from those of the car file,
     by less than this many standard deviations (Mahalanobis distance, without ``joint_interval_factor``). An infinite

@@ -288,7 +288,7 @@ def _extra_columns(channels: Channels, mapping: ColumnMapping) -> tuple[dict[str
             name += "_"
         extra[name] = extra.pop(SEGMENT)
         sentence = (
-            f"Column '{SEGMENT}' is kept as '{name}': in a recording, '{SEGMENT}' numbers the parts between gaps and "
+            f"Column '{SEGMENT}' is renamed '{name}': in a recording, '{SEGMENT}' numbers the parts between gaps and "
             "jumps."
         )
         findings.append(Finding("renamed_column", SEGMENT, Severity.INFO, sentence))

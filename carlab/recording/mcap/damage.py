@@ -37,7 +37,7 @@ class FileDefect:
         return "; ".join(part for part in (self.clause, f"{count} were recovered", self.remedy) if part)
 
 
-NEVER_FINISHED = FileDefect("was never finished", "")
+UNFINISHED = FileDefect("is incomplete, because its writer was stopped", "")
 
 
 def read_records(file: IO[bytes], take: Callable[[object], None], skip: Callable[[], None]) -> FileDefect | None:
@@ -87,7 +87,7 @@ def read_records(file: IO[bytes], take: Callable[[object], None], skip: Callable
     if damaged_at is not None:
         return FileDefect(f"is damaged at byte {damaged_at}", "copy it again", ticks_written)
     if str(file.name).endswith(PARTIAL_SUFFIX):
-        return NEVER_FINISHED
+        return UNFINISHED
     return FileDefect(
         f"ends at byte {size} before its closing record (it was not copied as a whole, or its writer was stopped)",
         "copy it again",

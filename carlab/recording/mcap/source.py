@@ -18,7 +18,7 @@ from carlab.core.quantities import Action, Observation, PoseSample
 from carlab.recording.episode_builder import RECOVERED, RECOVERY, episode_from_documents
 from carlab.recording.mcap import messages as messages
 from carlab.recording.mcap import schemas as schemas
-from carlab.recording.mcap.damage import MAGIC, NEVER_FINISHED, FileDefect, read_records
+from carlab.recording.mcap.damage import MAGIC, UNFINISHED, FileDefect, read_records
 from carlab.recording.sink import LogLine, partial_path
 
 
@@ -58,7 +58,7 @@ def read_episode(path: Path | str) -> EpisodeData:
     try:
         episode = episode_from_documents(recording.documents, recording.extra, recording.run_metadata)
     except DataError as error:
-        if recording.defect not in (None, NEVER_FINISHED):
+        if recording.defect not in (None, UNFINISHED):
             raise DataError(_no_tick(recording.path, recording.defect)) from error
         raise DataError(str(error).replace("The recording", str(recording.path), 1)) from error
     if recording.defect is None:
@@ -100,7 +100,7 @@ def _not_an_mcap(path: Path, head: bytes) -> str:
 
 def _no_tick(path: Path, defect: FileDefect | None) -> str:
     """Sentence about a recording that ends before its first tick."""
-    if defect in (None, NEVER_FINISHED):
+    if defect in (None, UNFINISHED):
         return f"{path} holds no complete tick (its writer was stopped before the episode began); record it again."
     return f"{path} holds no complete tick and {defect.clause}; {defect.remedy}."
 
@@ -209,7 +209,7 @@ class _Collector:
                 "read it with the version that wrote it."
             ) from error
         if defect is None and not isinstance(documents[-1], EpisodeEnded):
-            defect = NEVER_FINISHED
+            defect = UNFINISHED
         return Recording(path, tuple(documents), self._run, tuple(self._log), defect, self._extra)
 
     def _assemble(self) -> Iterator[Document]:
