@@ -1,4 +1,4 @@
-"""The results of ``carlab.drive`` are kept after an error and after ^C."""
+"""``carlab.drive`` writes its results after an error and after ^C too."""
 
 from __future__ import annotations
 

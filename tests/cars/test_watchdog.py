@@ -106,5 +106,5 @@ def test_command_that_the_watchdog_replaced_is_reported(tmp_path: Path) -> None:
         values = motor_values(car, t_s)
         first = values.index(2.0)
         assert 0.0 in values[first:], "the firmware has received neutral between two equal commands"
-        assert "watchdog" in [event.kind for event in events]
+        assert [event.kind for event in events] == ["watchdog"]
         safe.stop(planned=True)
