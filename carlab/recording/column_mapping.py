@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -136,8 +136,7 @@ class ColumnMapping:
             raise ConfigError(
                 f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero, at most {max_rate_hz:g}."
             )
-        if self.swap_xy and self.dead_reckoning:
-            raise ConfigError(f"Mapping '{self.layout}' has no x and y to exchange (no pose); remove swap_xy.")
+        self._check_dead_reckoning()
         _check_lag("velocity_lag", self.velocity_lag_s)
         _check_lag("command_lag", self.command_lag_s)
         for channel, source in self.columns.items():
@@ -150,6 +149,26 @@ class ColumnMapping:
                     'column measures, for example "vx".'
                 )
         check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
+
+    def _check_dead_reckoning(self) -> None:
+        """Raise ConfigError if an option that needs a pose is set without one."""
+        needs_pose = ("swap_xy", "yaw_offset_rad", "velocity_frame", "velocity_lag_s", "velocities", "repair_yaw_rate")
+        defaults = {f.name: f.default for f in dataclasses.fields(self)}
+        for option in needs_pose if self.dead_reckoning else ():
+            if getattr(self, option) != defaults[option]:
+                raise ConfigError(f"Mapping '{self.layout}' has no pose, so {option} has no effect; remove {option}.")
+
+    def velocity_columns(self, channels: Container[str]) -> tuple[str, ...]:
+        """Velocity channels of the state that are columns, of a file with columns for ``channels``.
+
+        vx and vy are taken together or not at all; dead reckoning needs vx only.
+        """
+        if self.dead_reckoning:
+            return "vx", "yaw_rate"
+        if self.velocities == "pose":
+            return ()
+        planar = ("vx", "vy") if "vx" in channels and "vy" in channels else ()
+        return (*planar, "yaw_rate") if "yaw_rate" in channels else planar
 
     def _check_distinct_columns(self) -> None:
         """Raise ConfigError if two channels, or a channel and the throttle gate, have the same column."""

@@ -68,11 +68,6 @@ def test_text_in_the_throttle_gate_is_refused_with_its_row(drive, tmp_path):
         import_csv(path, mapping=CANONICAL.with_options(throttle_gate="gate"))
 
 
-def test_axes_cannot_be_exchanged_without_a_pose():
-    with pytest.raises(ConfigError, match=r"'dart on-board' has no x and y to exchange .*remove swap_xy"):
-        DART_ONBOARD.with_options(swap_xy=True)
-
-
 def test_clock_cannot_be_rebuilt_without_a_pose(tmp_path):
     t_s = np.arange(301) / 30.0
     named = foreign.drive(t_s)

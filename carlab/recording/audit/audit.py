@@ -5,7 +5,7 @@ The audit does not change the data. Each finding has evidence and, if available,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,23 +119,40 @@ def _check_velocities(
 ) -> tuple[list[Finding], BoolArray]:
     """Checks of vx, vy and yaw_rate against the pose. Returns findings and the mask of yaw_rate spikes, (N,)."""
     t_s, values = channels.t_s, channels.values
-    is_used = mapping.velocities == "columns"
+    columns = mapping.velocity_columns(values)
     findings: list[Finding] = []
     spikes = np.zeros(len(t_s), dtype=bool)
     if "vx" in values and "vy" in values:
-        findings += _check_velocity(t_s, np.stack([values["vx"], values["vy"]]), motion, mapping) if is_used else []
+        velocity = np.stack([values["vx"], values["vy"]])
+        findings += _check_velocity(t_s, velocity, motion, mapping) if "vx" in columns else []
         clock = nominal_clock(t_s, channels.periods_s())
-        if clock is not None:
+        if clock is not None and mapping.clock == "velocity":
+            findings.append(Finding.of_fault(clock, Severity.REPAIRED, "they were rebuilt from distance over speed"))
+        elif clock is not None:
             findings.append(Finding.of_fault(clock, Severity.WARNING, "rebuild them with --clock velocity"))
-    if "yaw_rate" in values and is_used:
+    if "yaw_rate" in columns:
         found, spikes = _check_yaw_rate(t_s, values["yaw_rate"], motion, mapping)
         findings += found
-    estimated = ", ".join(name for name in VELOCITY_CHANNELS if name not in values or not is_used)
-    if estimated:
-        absent = "are not in the file and " if is_used else ""
-        sentence = f"{estimated} {absent}were estimated from the pose: {motion.method()}."
-        findings.append(Finding("estimated_velocity", estimated, Severity.INFO, sentence))
-    return findings, spikes
+    estimated = [name for name in VELOCITY_CHANNELS if name not in columns]
+    return findings + (_estimated_velocities(estimated, values, motion, mapping) if estimated else []), spikes
+
+
+def _estimated_velocities(
+    estimated: Sequence[str], values: Mapping[str, FloatArray], motion: PoseMotion, mapping: ColumnMapping
+) -> list[Finding]:
+    """Velocities that were estimated from the pose, and columns that are not used for this reason."""
+    names = ", ".join(estimated)
+    sentence = f"Estimated from the pose: {names}, by a {motion.method()}."
+    findings = [Finding("estimated_velocity", names, Severity.INFO, sentence)]
+    unused = [name for name in estimated if name in values]
+    if unused and mapping.velocities == "columns":
+        absent = "vy" if unused[0] == "vx" else "vx"
+        sentence = (
+            f"Column '{mapping.columns[unused[0]].name}' is kept as an extra column and not used for the state: vx and "
+            f"vy are taken together, and the file has no {absent}."
+        )
+        findings.append(Finding("unused_column", unused[0], Severity.WARNING, sentence))
+    return findings
 
 
 def _check_velocity(t_s: FloatArray, velocity: FloatArray, motion: PoseMotion, mapping: ColumnMapping) -> list[Finding]:

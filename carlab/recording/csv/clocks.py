@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,8 +12,10 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.audit import Channels
 from carlab.recording.audit.report import Finding, Severity
+from carlab.recording.column_mapping import POSE_CHANNELS
 from carlab.recording.faults.robust import robust_std
 from carlab.recording.faults.stamps import gap_rows
+from carlab.recording.pose_velocity import pose_motion
 
 _MIN_ROWS = 200
 _MEDIAN_FILTER_ROWS = 51
@@ -22,9 +25,9 @@ def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
     """Stamps (N,) [s] from distance over speed, with the median period below 0.3 m/s, and a note about them.
 
     Raises:
-        DataError: there are no x, y, vx and vy columns, or the car hardly moves.
+        DataError: there is no pose, there are no vx and vy columns, or the car hardly moves.
     """
-    if any(name not in channels.values for name in ("x", "y", "vx", "vy")):
+    if channels.motion is None or any(name not in channels.values for name in ("vx", "vy")):
         raise DataError("The clock cannot be rebuilt without x, y, vx and vy columns; use --clock column.")
     periods_s = channels.periods_s()
     median_s = float(np.nanmedian(periods_s)) if np.isfinite(periods_s).any() else float("nan")
@@ -36,6 +39,18 @@ def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
     steps_s = np.where(is_plausible, periods_s, np.where(is_break, np.diff(channels.t_s), median_s))
     note = f"rebuilt from distance over speed for {int(is_plausible.sum())} of {len(steps_s)} periods, median elsewhere"
     return np.concatenate([[0.0], np.cumsum(steps_s)]), note
+
+
+def with_rebuilt_clock(channels: Channels) -> tuple[Channels, str]:
+    """The channels with the stamps of ``rebuilt_clock`` and the motion of the pose by them, and its note.
+
+    Raises:
+        DataError: as ``rebuilt_clock``.
+    """
+    t_s, note = rebuilt_clock(channels)
+    x_m, y_m, yaw_rad = (channels.values[name] for name in POSE_CHANNELS)
+    motion = pose_motion(t_s, x_m, y_m, yaw_rad, channels.segment)
+    return replace(channels, t_s=t_s, motion=motion), note
 
 
 def even_clock(t_s: FloatArray) -> tuple[FloatArray, list[Finding]]:

@@ -25,7 +25,7 @@ from carlab.recording.column_mapping import (
     missing_columns,
     recognise_layout,
 )
-from carlab.recording.csv.clocks import even_clock, rebuilt_clock
+from carlab.recording.csv.clocks import even_clock, with_rebuilt_clock
 from carlab.recording.csv.table import CsvTable, read_csv
 from carlab.recording.faults.robust import held_at
 from carlab.recording.faults.stamps import gap_rows, segments
@@ -95,10 +95,10 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     new_findings, spikes = audit_channels(channels, mapping)
     findings += new_findings
     raise_errors(source, findings)
-    states, notes = _states(channels, mapping, spikes)
+    clock_notes: dict[str, str] = {}
     if mapping.clock == "velocity":
-        t_s, note = rebuilt_clock(channels)
-        notes["clock"] = note
+        channels, clock_notes["clock"] = with_rebuilt_clock(channels)
+    states, notes = _states(channels, mapping, spikes)
     metadata = {
         "source": str(table.path),
         "source_sha256": hashlib.sha256(table.path.read_bytes()).hexdigest(),
@@ -107,8 +107,9 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
         "time_origin_s": repr(origin_s),
         "units": "s, m, rad, m/s, rad/s; velocities in the body frame; commands in [-1, 1] held from their row on",
         **notes,
+        **clock_notes,
     }
-    episodes, new_findings = _episodes(t_s, states, channels, mapping, metadata)
+    episodes, new_findings = _episodes(states, channels, mapping, metadata)
     findings += new_findings
     announcement = f"{layout_note}; {_conversions(mapping)}."
     return ImportedRecording(episodes, AuditReport(source, mapping.layout, tuple(findings)), mapping, announcement)
@@ -171,7 +172,7 @@ def _converted_columns(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[st
             values["vx"], values["vy"] = values["vy"], values["vx"]
     if "yaw" in values:
         values["yaw"] = values["yaw"] + mapping.yaw_offset_rad
-    ignored = VELOCITY_CHANNELS if mapping.velocities == "pose" else ()
+    ignored = set(VELOCITY_CHANNELS).difference(mapping.velocity_columns(values))
     used = {source.name for channel, source in mapping.columns.items() if channel not in ignored}
     extra = {name: column for name, column in table.columns.items() if name not in used}
     return values, extra
@@ -215,10 +216,10 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
             "velocity_source": "columns",
         }
     pose = [values["x"], values["y"], values["yaw"]]
-    columns = mapping.velocities == "columns"
+    columns = mapping.velocity_columns(values)
     lag = mapping.velocity_lag_s
     sources, vx, vy, yaw_rate = [], motion.vx, motion.vy, motion.yaw_rate
-    if columns and "vx" in values and "vy" in values:
+    if "vx" in columns:
         vx, vy = values["vx"], values["vy"]
         sources.append(f"vx, vy: columns in the {mapping.velocity_frame} frame")
         if mapping.velocity_frame == "world":
@@ -226,7 +227,7 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
             sources[-1] += f", rotated by the yaw of {lag * 1e3:.1f} ms before"
     else:
         sources.append(f"vx, vy: {motion.method()}")
-    if columns and "yaw_rate" in values:
+    if "yaw_rate" in columns:
         yaw_rate = values["yaw_rate"]
         sources.append("yaw_rate: column")
         if mapping.repair_yaw_rate and spikes.any():
@@ -234,8 +235,7 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
             sources[-1] += f", {int(spikes.sum())} rows of wrap spikes taken from the pose"
     else:
         sources.append(f"yaw_rate: {motion.method()}")
-    used_columns = columns and any(name in values for name in ("vx", "yaw_rate"))
-    notes = {"velocity_source": "; ".join(sources), "velocity_delay_s": f"{lag if used_columns else 0.0:.6g}"}
+    notes = {"velocity_source": "; ".join(sources), "velocity_delay_s": f"{lag if columns else 0.0:.6g}"}
     return np.column_stack([*pose, vx, vy, yaw_rate]), notes
 
 
@@ -250,9 +250,10 @@ def _dead_reckoned(t_s: FloatArray, vx: FloatArray, yaw_rate: FloatArray) -> Flo
 
 
 def _episodes(
-    t_s: FloatArray, states: FloatArray, channels: Channels, mapping: ColumnMapping, metadata: Mapping[str, str]
+    states: FloatArray, channels: Channels, mapping: ColumnMapping, metadata: Mapping[str, str]
 ) -> tuple[tuple[EpisodeData, ...], list[Finding]]:
-    requested, sent, findings = _commands(t_s, channels, mapping)
+    t_s = channels.t_s
+    requested, sent, findings = _commands(channels, mapping)
     parts, row_findings = _episode_rows(channels.segment, mapping)
     extra, extra_findings = _extra_columns(channels, mapping)
     episodes = []
@@ -297,10 +298,9 @@ def _extra_columns(channels: Channels, mapping: ColumnMapping) -> tuple[dict[str
     return extra, findings
 
 
-def _commands(
-    t_s: FloatArray, channels: Channels, mapping: ColumnMapping
-) -> tuple[FloatArray, FloatArray, list[Finding]]:
+def _commands(channels: Channels, mapping: ColumnMapping) -> tuple[FloatArray, FloatArray, list[Finding]]:
     """Requested and sent commands (N, 2), and findings about their conversion."""
+    t_s = channels.t_s
     requested = np.column_stack([channels.values["steering"], channels.values["throttle"]])
     sent = requested.copy()
     if mapping.throttle_gate:

@@ -1,0 +1,85 @@
+"""Velocities of imported recordings: which columns are used, and by which clock the pose is differentiated."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.core.errors import ConfigError
+from carlab.recording.audit.report import Severity
+from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD
+from carlab.recording.csv.foreign import import_csv
+
+_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
+foreign = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(foreign)
+
+
+@pytest.mark.parametrize("option", [{"velocities": "pose"}, {}])
+def test_velocities_from_the_pose_have_the_rebuilt_clock(tmp_path, option):
+    """The stamps say 30 Hz, but every fifth row comes 67 ms after the one before."""
+    step_s = np.where(np.arange(1499) % 5 == 0, 2.0, 1.0) / 30.0
+    true_t = np.concatenate([[0.0], np.cumsum(step_s)])
+    columns = foreign.drive(true_t)
+    along = np.concatenate([[0.0], np.hypot(np.diff(columns["x"]), np.diff(columns["y"])) / step_s])
+    columns["vx"] = np.copysign(along, foreign.speed(true_t))
+    del columns["yaw_rate"]
+    columns["t"] = np.arange(1500) / 30.0
+    path = foreign.write(tmp_path / "run.csv", columns)
+    imported = import_csv(path, mapping=CANONICAL.with_options(clock="velocity", **option))
+    # Below 0.3 m/s the distance gives no period; compare the rows whose neighbours are all faster.
+    rows = np.convolve(np.abs(foreign.speed(true_t)) < 0.4, np.ones(11), mode="same") == 0
+    states = imported.episode.states[rows]
+    np.testing.assert_allclose(states[5:-5, 5], foreign.yaw_rate(true_t[rows])[5:-5], atol=0.05)
+    np.testing.assert_allclose(states[5:-5, 3], foreign.speed(true_t[rows])[5:-5], atol=0.05)
+    (finding,) = imported.report.of("clock_drift")
+    assert finding.severity is Severity.REPAIRED
+    assert finding.option is None
+
+
+@pytest.mark.parametrize(("present", "absent"), [("vx", "vy"), ("vy", "vx")])
+def test_velocity_column_without_the_other_is_kept_as_extra(tmp_path, present, absent):
+    t_s = np.arange(900) / 50.0
+    columns = foreign.drive(t_s)
+    columns["wheel"] = 1.5 * columns.pop("vx")  # a wheel sensor that slips
+    del columns["vy"]
+    path = foreign.write(tmp_path / "run.csv", columns)
+    mapping = CANONICAL.with_options(columns={present: {"name": "wheel"}}, velocity_lag_s=0.02)
+    imported = import_csv(path, mapping=mapping)
+    np.testing.assert_array_equal(imported.episode.extra["wheel"], columns["wheel"])
+    np.testing.assert_allclose(imported.episode.states[5:-5, 3], foreign.speed(t_s)[5:-5], atol=0.05)
+    np.testing.assert_array_equal(imported.episode.states[:, 5], columns["yaw_rate"])
+    assert imported.report.of("estimated_velocity")[0].channel == "vx, vy"
+    (finding,) = imported.report.of("unused_column")
+    assert "Column 'wheel' is kept as an extra column and not used for the state" in finding.sentence
+    assert finding.sentence.endswith(f"the file has no {absent}.")
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"swap_xy": True},
+        {"yaw_offset_rad": 1.0},
+        {"velocity_frame": "world"},
+        {"velocity_lag_s": 0.1},
+        {"velocities": "pose"},
+        {"repair_yaw_rate": True},
+    ],
+    ids=lambda option: next(iter(option)),
+)
+def test_option_without_effect_is_refused_for_dead_reckoning(option):
+    (name,) = option
+    with pytest.raises(ConfigError, match=rf"'dart on-board' has no pose, so {name} has no effect; remove {name}\."):
+        DART_ONBOARD.with_options(**option)
+
+
+def test_dead_reckoning_keeps_vy_as_extra(tmp_path):
+    t_s = np.arange(301) / 30.0
+    drive = foreign.drive(t_s)
+    columns = {source.name: drive[channel] for channel, source in DART_ONBOARD.columns.items()}
+    vy = np.sin(t_s)
+    path = foreign.write(tmp_path / "run.csv", {**columns, "vy": vy, "safety_value": np.ones(301)})
+    episode = import_csv(path, mapping=DART_ONBOARD.with_options(columns={"vy": {"name": "vy"}})).episode
+    np.testing.assert_array_equal(episode.extra["vy"], vy)
+    np.testing.assert_array_equal(episode.states[:, 4], 0.0)
