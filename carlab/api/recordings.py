@@ -241,5 +241,5 @@ def resolved_mapping(
     if not columns and not whole:
         return mapping
     if mapping is None:
-        mapping = recognise_layout(read_csv(path).header, path.name)
+        mapping = recognise_layout(read_csv(path).header, path.name, whole.get("rate_hz"))
     return mapping.with_options(columns=columns, **whole)

@@ -313,19 +313,25 @@ def missing_columns(mapping: ColumnMapping, header: Sequence[str]) -> list[str]:
     return lacking + [name for name in named if name not in header]
 
 
-def recognise_layout(header: Sequence[str], where: str) -> ColumnMapping:
-    """The preset whose columns ``header`` holds. Raises DataError that names what is missing and the remedy."""
-    for preset in _ORDER:
+def recognise_layout(header: Sequence[str], where: str, rate_hz: float | None = None) -> ColumnMapping:
+    """The preset whose columns ``header`` holds; with a row rate [Hz], the time column may be missing.
+
+    Raises DataError that names what is missing and the remedy.
+    """
+    presets = [preset.with_options(rate_hz=rate_hz) for preset in _ORDER]
+    for preset, mapping in zip(_ORDER, presets, strict=True):
         particular = [preset.columns[c].name for c in ("vx", "vy") if preset is ETH]
-        if not missing_columns(preset, header) and all(name in header for name in particular):
-            return preset
-    nearest = min(_ORDER, key=lambda preset: len(missing_columns(preset, header)))
+        if not missing_columns(mapping, header) and all(name in header for name in particular):
+            return preset if rate_hz is None else mapping
+    nearest = min(presets, key=lambda mapping: len(missing_columns(mapping, header)))
     lacking = missing_columns(nearest, header)
     names = [nearest.columns[c].name for c in nearest.columns]
     spare = [name for name in header if name not in names]
     near = difflib.get_close_matches(lacking[0].split(" (")[0], spare, n=1, cutoff=0.4)
     hint = f" (is it '{near[0]}'?)" if near else ""
+    lacks_time_only = rate_hz is None and len(lacking) == 1 and nearest.columns["t"].name not in header
+    rate = "give the rate of the rows with --rate, " if lacks_time_only else ""
     raise DataError(
         f"{where} has no column {', '.join(lacking)}{hint}; it holds {', '.join(header)}; "
-        f"say which column is which with carlab import --mapping FILE.toml, or add the column."
+        f"{rate}say which column is which with carlab import --mapping FILE.toml, or add the column."
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import carlab
 from carlab.core.errors import ConfigError, DataError
 from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD, load_mapping
 from carlab.recording.csv.foreign import import_csv
@@ -97,3 +98,19 @@ def test_stamps_that_are_closer_than_any_samples_are_refused(drive, tmp_path, fa
 def test_rate_that_no_sensor_has_is_refused(rate_hz):
     with pytest.raises(ConfigError, match=r"give a number above zero, at most 100000\."):
         replace(CANONICAL, rate_hz=rate_hz)
+
+
+def test_rate_replaces_the_time_column_of_a_known_layout(drive, tmp_path):
+    columns = {name: column for name, column in drive.items() if name != "t"}
+    path = foreign.write(tmp_path / "run.csv", columns)
+    episode = carlab.load(path, rate=30.0).episode
+    np.testing.assert_allclose(episode.times_s, drive["t"], rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(episode.states[:, 0], drive["x"])
+    with pytest.raises(DataError, match=r"has no column t; .*; give the rate of the rows with --rate, say which"):
+        carlab.load(path)
+    columns["yaw_deg"] = columns.pop("yaw")
+    named = foreign.write(tmp_path / "named.csv", columns)
+    with pytest.raises(DataError, match=r"has no column yaw \(is it 'yaw_deg'\?\); .*; say which"):
+        carlab.load(named, rate=30.0)
+    with pytest.raises(ConfigError, match="'rate_hz' in the mapping's options must be a number, not 'fast'"):
+        carlab.load(path, rate="fast")
