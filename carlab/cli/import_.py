@@ -167,10 +167,12 @@ class Import:
         console.print(imported.announcement)
         print_findings(imported.report)
         self._write_report(imported.report)
-        many = len(imported.episodes) > 1
-        for index, episode in enumerate(imported.episodes, start=1):
-            path = out.with_name(f"{out.stem}-{index}{out.suffix}") if many else out
+        n_episodes = len(imported.episodes)
+        parts = [out.with_name(f"{out.stem}-{k + 1}{out.suffix}") for k in range(n_episodes)]
+        paths = parts if n_episodes > 1 else [out]
+        for path in paths:
             new_file(path, "--out", ".mcap")
+        for path, episode in zip(paths, imported.episodes, strict=True):
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
                 write_episode(episode, path)

@@ -172,6 +172,17 @@ def test_clock_that_starts_again_is_cut_and_not_dropped(carlab: Carlab, tmp_path
     assert f"would leave out {len(data) - half} of {len(data)} rows" in text
 
 
+def test_no_part_is_written_if_one_exists(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    data[len(data) // 2 :, 0] += 5.0
+    (tmp_path / "run-2.mcap").write_bytes(b"other")
+    code, text = carlab("import", write(path, data), "--gaps", "split", "--out", tmp_path / "run.mcap")
+    assert code == 1
+    assert "run-2.mcap exists already" in text
+    assert not (tmp_path / "run-1.mcap").exists()
+    assert (tmp_path / "run-2.mcap").read_bytes() == b"other"
+
+
 def test_rate_of_a_file_with_a_time_column_is_refused(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
     code, text = carlab("import", drive_csv, "--rate", "30", "--out", tmp_path / "a.mcap")
     assert code == 1
