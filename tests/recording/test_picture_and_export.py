@@ -123,3 +123,9 @@ def test_extra_column_does_not_replace_a_standard_one(episode):
     table = table_of(dataclasses.replace(episode, extra={"yaw": np.ones(61)}))
     np.testing.assert_array_equal(table["yaw"], episode.states[:, 2])
     np.testing.assert_array_equal(table["extra_yaw"], np.ones(61))
+
+
+def test_extra_columns_do_not_replace_each_other(episode):
+    extra = {"extra_yaw": np.full(61, 2.0), "yaw": np.full(61, 1.0)}
+    table = table_of(dataclasses.replace(episode, extra=extra))
+    assert {float(column[0]) for name, column in table.items() if name.startswith("extra_")} == {1.0, 2.0}

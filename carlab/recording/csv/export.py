@@ -39,7 +39,9 @@ def table_of(episode: EpisodeData) -> dict[str, FloatArray]:
     if not np.isnan(episode.rewards).all():
         columns["reward"] = np.append(episode.rewards, np.nan)
     for name, values in episode.extra.items():
-        columns[f"extra_{name}" if name in columns else name] = values
+        while name in columns:
+            name = f"extra_{name}"
+        columns[name] = values
     return columns
 
 
