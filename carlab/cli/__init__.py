@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 5 recordings 
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -16,6 +17,9 @@ from carlab.cli.exit_codes import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the ``carlab`` command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # A terminal in Latin-1 cannot show every file name.
+            stream.reconfigure(errors="backslashreplace")
     try:
         try:
             code = run(sys.argv[1:] if argv is None else argv)

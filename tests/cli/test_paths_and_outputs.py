@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 from collections.abc import Callable
@@ -170,6 +171,17 @@ def test_clock_that_starts_again_is_cut_and_not_dropped(carlab: Carlab, tmp_path
     assert code == 1
     assert f"the clock starts again in row {half + 1}, so cut the file in front of it" in text
     assert f"would leave out {len(data) - half} of {len(data)} rows" in text
+
+
+def test_name_that_the_terminal_cannot_show_is_escaped(
+    drive_csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(shown, encoding="latin-1"))
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["export", str(drive_csv), "--out", str(tmp_path / "\u65e5.csv")])
+    assert ended.value.code == 0
+    assert b"\\u65e5.csv: 60 rows" in shown.getvalue()
 
 
 def test_no_part_is_written_if_one_exists(carlab: Carlab, tmp_path: Path) -> None:
