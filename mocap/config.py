@@ -10,6 +10,9 @@ from typing import Literal
 from carlab.core.errors import ConfigError, ProtocolError
 from mocap.natnet.models import NEWEST_BITSTREAM, OLDEST_BITSTREAM, BitstreamVersion
 
+MAX_TIMEOUT_S = 600.0
+"""Longest wait for a server [s]; a person notices earlier that it does not answer."""
+
 
 @dataclass(frozen=True, slots=True)
 class MocapConfig:
@@ -40,7 +43,7 @@ class MocapConfig:
     pivot_in_base_link_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the rigid body's pivot on the car: forward, left and up of base_link."""
     timeout_s: float = 2.0
-    """Longest wait for the server, for its list of bodies and for its first frame, each."""
+    """Longest wait for the server, for its list of bodies and for its first frame, each [s]; at most 600."""
 
     def __post_init__(self) -> None:
         if not self.server_address.strip():
@@ -60,8 +63,11 @@ class MocapConfig:
                 raise ConfigError(
                     f"'{name}' in [hardware.mocap]{option} is {port}; a port is a number from {low} to 65535."
                 )
-        if not self.timeout_s > 0.0:
-            raise ConfigError(f"'timeout_s' in [hardware.mocap] is {self.timeout_s}; it must be above zero.")
+        if not 0.0 < self.timeout_s <= MAX_TIMEOUT_S:
+            raise ConfigError(
+                f"'timeout_s' in [hardware.mocap] is {self.timeout_s:g} s; it must be above zero, at most "
+                f"{MAX_TIMEOUT_S:g} s (is it in milliseconds?)."
+            )
         if self.body and self.body_id is not None:
             raise ConfigError(
                 "[hardware.mocap] has both 'body' and 'body_id' (listen: --body, --body-id); keep one of them."

@@ -67,7 +67,7 @@ class CanLink:
             self._lock.acquire()
         try:
             self._bus = self._open_bus()
-        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
+        except (can.CanError, OSError, ValueError, OverflowError, ImportError, NotImplementedError) as error:
             self._unlock()
             raise NotReadyError(
                 f"CAN bus {self.interface} {self.channel} cannot be opened", (self._reason(error),)

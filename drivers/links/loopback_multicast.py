@@ -35,7 +35,7 @@ class _LoopbackSocket(GeneralPurposeUdpMulticastBus):
             sock.bind((self.group, self.port))
             membership = socket.inet_aton(self.group) + socket.inet_aton(LOOPBACK)
             sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-        except OSError:
+        except BaseException:
             sock.close()
             raise
         return sock

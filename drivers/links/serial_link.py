@@ -45,7 +45,7 @@ class SerialLink:
             return
         try:
             self._serial = serial.Serial(self.port, self.baud, timeout=0, exclusive=True)
-        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
+        except (OSError, ValueError, OverflowError, termios.error) as error:  # SerialException is an OSError
             raise NotReadyError(f"Serial port {self.port} cannot be opened", (self._reason(error),)) from error
         self.statistics.opens += 1
 

@@ -114,8 +114,9 @@ def test_two_links_exclude_each_other_until_one_is_closed() -> None:
     second.close()
 
 
-def test_failed_opening_releases_the_controller(own_folder: Path) -> None:
-    link = CanLink("no_such_interface", "x", controller_id=23)
+@pytest.mark.parametrize(("interface", "channel"), [("no_such_interface", "x"), ("udp_multicast", "239.1.1.1:99999")])
+def test_failed_opening_releases_the_controller(own_folder: Path, interface: str, channel: str) -> None:
+    link = CanLink(interface, channel, controller_id=23)
     for _ in range(2):
         with pytest.raises(NotReadyError, match="cannot be opened"):
             link.open()

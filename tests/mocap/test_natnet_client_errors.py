@@ -106,6 +106,8 @@ def test_invalid_server_options_are_refused(options: dict[str, Any], message: st
         ({"mode": "broadcast"}, "unicast or multicast"),
         ({"up_axis": "x"}, "y or z"),
         ({"timeout_s": 0.0}, "timeout_s"),
+        ({"timeout_s": 2000.0}, "'timeout_s' .* is 2000 s; .* at most 600 s"),
+        ({"timeout_s": float("inf")}, "'timeout_s' .* is inf s"),
         ({"body": "car", "body_id": 1}, "body_id"),
         ({"multicast_group": "127.0.0.1"}, "224.0.0.0"),
         ({"multicast_group": "group"}, "224.0.0.0"),
