@@ -111,8 +111,8 @@ class ColumnMapping:
     throttle_gate: str | None = None
     """Column that multiplied the throttle on the car: ``requested`` keeps the column, ``sent`` is the product."""
     references: Mapping[str, str] = field(default_factory=dict)
-    """Further sensor columns that measure a state channel again, for example ``{"vel encoder" = "vx"}``; they are only
-    compared with it."""
+    """Further sensor columns that measure vx, vy or yaw_rate again, for example ``{"vel encoder" = "vx"}``; they are
+    only compared with it."""
     dead_reckoning: bool = False
     """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
     clock: Literal["column", "velocity", "even"] = "column"
@@ -148,7 +148,8 @@ class ColumnMapping:
                     f"The reference '{name}' of mapping '{self.layout}' is {channel!r}; name the channel that the "
                     'column measures, for example "vx".'
                 )
-        check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
+        references = dict.fromkeys(self.references.values())
+        check_keys(references, VELOCITY_CHANNELS, f"the references of mapping '{self.layout}'")
 
     def _check_dead_reckoning(self) -> None:
         """Raise ConfigError if an option that needs a pose is set without one."""

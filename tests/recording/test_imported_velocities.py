@@ -50,7 +50,9 @@ def test_velocity_column_without_the_other_is_kept_as_extra(tmp_path, present, a
     np.testing.assert_array_equal(imported.episode.extra["wheel"], columns["wheel"])
     np.testing.assert_allclose(imported.episode.states[5:-5, 3], foreign.speed(t_s)[5:-5], atol=0.05)
     np.testing.assert_array_equal(imported.episode.states[:, 5], columns["yaw_rate"])
-    assert imported.report.of("estimated_velocity")[0].channel == "vx, vy"
+    (estimated,) = imported.report.of("estimated_velocity")
+    assert estimated.channel == "vx, vy"
+    assert f"vx, vy (the file has no {absent}), by a" in estimated.sentence
     (finding,) = imported.report.of("unused_column")
     assert "Column 'wheel' is kept as an extra column and not used for the state" in finding.sentence
     assert finding.sentence.endswith(f"the file has no {absent}.")
@@ -83,3 +85,19 @@ def test_dead_reckoning_keeps_vy_as_extra(tmp_path):
     episode = import_csv(path, mapping=DART_ONBOARD.with_options(columns={"vy": {"name": "vy"}})).episode
     np.testing.assert_array_equal(episode.extra["vy"], vy)
     np.testing.assert_array_equal(episode.states[:, 4], 0.0)
+
+
+def test_reference_that_is_not_compared_is_reported(tmp_path):
+    columns = foreign.drive(np.arange(900) / 50.0)
+    columns["encoder"] = 1.1 * columns["vx"]
+    path = foreign.write(tmp_path / "run.csv", columns)
+
+    def findings(name):
+        return import_csv(path, mapping=CANONICAL.with_options(references={name: "vx"})).report.of("unused_column")
+
+    for name in ("encodr", "vx"):
+        (finding,) = findings(name)
+        assert f"Reference '{name}' is not compared with vx" in finding.sentence
+    assert not findings("encoder")
+    with pytest.raises(ConfigError, match="Unknown key 'steering' in the references of mapping"):
+        CANONICAL.with_options(references={"encoder": "steering"})

@@ -13,7 +13,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit import file_checks
 from carlab.recording.audit.report import AuditReport, Finding, Severity
-from carlab.recording.column_mapping import COMMAND_CHANNELS, VELOCITY_CHANNELS, ColumnMapping
+from carlab.recording.column_mapping import COMMAND_CHANNELS, VELOCITY_CHANNELS, ColumnMapping, ColumnSource
 from carlab.recording.faults.commands import (
     MIN_ROWS,
     CommandResponse,
@@ -84,11 +84,14 @@ def audit_channels(channels: Channels, mapping: ColumnMapping) -> tuple[list[Fin
     findings += found + _check_commands(channels, motion, mapping)
     states = velocity_references(motion)
     for name, channel in mapping.references.items():
-        if name in channels.extra and channel in states:
-            found = file_checks.check_reference(t_s, name, channels.extra[name], channel, states[channel])
-            # Several sensors detect the same frozen pose; only the first finding is reported.
-            known = {f.id for f in findings} & {"frozen_pose"}
-            findings += [f for f in found if f.id not in known]
+        if name not in channels.extra:
+            sentence = f"Reference '{name}' is not compared with {channel}: it is no extra column with numbers."
+            findings.append(Finding("unused_column", channel, Severity.WARNING, sentence))
+            continue
+        found = file_checks.check_reference(t_s, name, channels.extra[name], channel, states[channel])
+        # Several sensors detect the same frozen pose; only the first finding is reported.
+        known = {f.id for f in findings} & {"frozen_pose"}
+        findings += [f for f in found if f.id not in known]
     return findings, spikes
 
 
@@ -142,7 +145,9 @@ def _estimated_velocities(
 ) -> list[Finding]:
     """Velocities that were estimated from the pose, and columns that are not used for this reason."""
     names = ", ".join(estimated)
-    sentence = f"Estimated from the pose: {names}, by a {motion.method()}."
+    missing = [mapping.columns.get(name, ColumnSource(name)).name for name in estimated if name not in values]
+    reason = f" (the file has no {', '.join(missing)})" if missing and mapping.velocities == "columns" else ""
+    sentence = f"Estimated from the pose: {names}{reason}, by a {motion.method()}."
     findings = [Finding("estimated_velocity", names, Severity.INFO, sentence)]
     unused = [name for name in estimated if name in values]
     if unused and mapping.velocities == "columns":
