@@ -18,23 +18,35 @@ if TYPE_CHECKING:
 APPLICATION = "carlab"
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write text as UTF-8; after an error an existing file is unchanged.
+@contextmanager
+def replaced_file(path: Path) -> Iterator[Path]:
+    """Path to write; it replaces ``path`` when the block ends. After an error it is removed, and ``path`` is unchanged.
 
     Raises:
         DataError: it cannot be written.
     """
     partial = partial_path(path)
     try:
-        with partial.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        yield partial
         os.replace(partial, path)
-    except OSError as error:
+    except BaseException as error:
         with suppress(OSError):
             partial.unlink()
-        raise DataError(describe_os_error(error, path)) from error
+        if isinstance(error, OSError):
+            raise DataError(describe_os_error(error, path)) from error
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text as UTF-8; after an error an existing file is unchanged.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    with replaced_file(path) as partial, partial.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -75,4 +87,4 @@ def rerun_file(
             partial.unlink(missing_ok=True)
 
 
-__all__ = ["rerun_file", "write_text"]
+__all__ = ["replaced_file", "rerun_file", "write_text"]

@@ -129,3 +129,13 @@ def test_extra_columns_do_not_replace_each_other(episode):
     extra = {"extra_yaw": np.full(61, 2.0), "yaw": np.full(61, 1.0)}
     table = table_of(dataclasses.replace(episode, extra=extra))
     assert {float(column[0]) for name, column in table.items() if name.startswith("extra_")} == {1.0, 2.0}
+
+
+@pytest.mark.parametrize(
+    ("write", "name"), [(write_csv, "x.csv"), (write_csv, "x.csv.gz"), (write_parquet, "x.parquet")]
+)
+def test_export_that_fails_leaves_no_file(tmp_path, episode, write, name):
+    (tmp_path / name).mkdir()
+    with pytest.raises(DataError, match=f"{name} could not be written: Is a directory"):
+        write(episode, tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -19,9 +19,9 @@ from typing import TextIO
 import numpy as np
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError
 from carlab.core.quantities import ACTION_NAMES, STATE_NAMES, STATE_UNITS, FloatArray
-from carlab.recording.sink import describe_os_error, make_folder, partial_path
+from carlab.recording.atomic_files import replaced_file
+from carlab.recording.sink import make_folder
 
 COLUMN_UNITS = {"t": "s", **dict(zip(STATE_NAMES, STATE_UNITS, strict=True)), **dict.fromkeys(ACTION_NAMES, "1")}
 _UNIT_SUFFIXES = {"_s": "s", "_m": "m", "_rad": "rad", "_mps": "m/s", "_radps": "rad/s", "_hz": "1/s", "_v": "V"}
@@ -64,30 +64,27 @@ def write_csv(episode: EpisodeData, path: Path | str) -> None:
     """
     path = Path(path)
     table = table_of(episode)
-    try:
+    with replaced_file(path) as partial:
         make_folder(path.parent)
-        with _text_file(path) as file:
+        with _text_file(partial, compressed=path.suffix == ".gz") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(table)
             columns = [[repr(v) if v == v else "" for v in values.tolist()] for values in table.values()]
             writer.writerows(zip(*columns, strict=True))
-        partial_path(path).replace(path)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
 
 
 @contextlib.contextmanager
-def _text_file(path: Path) -> Iterator[TextIO]:
-    if path.suffix == ".gz":
+def _text_file(path: Path, *, compressed: bool) -> Iterator[TextIO]:
+    if compressed:
         # The gzip header has no time and no name, so that equal episodes give equal bytes.
         with (
-            partial_path(path).open("wb") as file,
-            gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as compressed,
-            io.TextIOWrapper(compressed, encoding="utf-8", newline="") as text,
+            path.open("wb") as file,
+            gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as archive,
+            io.TextIOWrapper(archive, encoding="utf-8", newline="") as text,
         ):
             yield text
     else:
-        with partial_path(path).open("w", newline="", encoding="utf-8") as text:
+        with path.open("w", newline="", encoding="utf-8") as text:
             yield text
 
 
@@ -104,9 +101,6 @@ def write_parquet(episode: EpisodeData, path: Path | str) -> None:
     table = table_of(episode)
     fields = [pa.field(name, pa.float64(), metadata={"unit": unit_of(name)}) for name in table]
     schema = pa.schema(fields, metadata={"carlab": json.dumps(dict(episode.metadata))})
-    try:
+    with replaced_file(path) as partial:
         make_folder(path.parent)
-        pq.write_table(pa.table(list(table.values()), schema=schema), partial_path(path))
-        partial_path(path).replace(path)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
+        pq.write_table(pa.table(list(table.values()), schema=schema), partial)
