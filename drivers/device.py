@@ -40,7 +40,7 @@ class Telemetry(Protocol):
 
     @property
     def fault_code(self) -> int | None:
-        """Fault code of the firmware; 0 for no fault."""
+        """Fault code of the firmware; 0 for no fault. Telemetry without it does not count as fresh."""
 
     @property
     def motor_timeout_active(self) -> bool:

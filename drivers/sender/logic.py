@@ -136,11 +136,15 @@ class SenderLogic:
             self._latch(refusal)
 
     def telemetry(self, t_s: float, values: Telemetry) -> None:
-        """Event: telemetry received; a fault of the firmware or its kill switch latches a fault."""
+        """Event: telemetry received; a fault of the firmware or its kill switch latches a fault.
+
+        Telemetry without a fault code is a broadcast: it does not show that the firmware receives commands.
+        """
         self.values = values if self.values is None else self.values.updated(values)
-        self.t_values_s = t_s
-        if self.state == SenderState.DISCONNECTED and self.is_ready_to_send:
-            self.state = SenderState.CONNECTED
+        if values.fault_code is not None:
+            self.t_values_s = t_s
+            if self.state == SenderState.DISCONNECTED and self.is_ready_to_send:
+                self.state = SenderState.CONNECTED
         if (cause := self._firmware_cause()) and self.state != SenderState.DISCONNECTED:
             self._latch(cause)
 

@@ -109,6 +109,21 @@ def test_drive_reaches_the_firmware_and_ends_in_neutral(interface: str, status_r
         assert served.log.wait_for("motor_timeout", TIMEOUT_S) is not None
 
 
+def test_broadcasts_of_a_controller_that_does_not_answer_are_no_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its receiver fails while it drives: it broadcasts its status, but obeys no command and answers no request."""
+    channel = channel_name()
+    firmware = VescFirmware(CommandLog(), motor_timeout_s=0.4)
+    config = config_for("virtual", channel, telemetry_stale_s=0.5, telemetry_lost_s=1.0)
+    served = CanFirmware(firmware, "virtual", channel, status_rate_hz=50.0)
+    with served, Actuator(config, CALIBRATION) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: bool(served.log.motor()))
+        monkeypatch.setattr(served, "_handle_frame", lambda bus, frame, now_s: None)
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        assert "the VESC stopped answering" in actuator.status().fault
+
+
 def test_driving_continues_despite_lost_frames() -> None:
     channel = channel_name()
     faults = WireFaults(drop_share=0.1, corrupt_share=0.1, seed=1)
