@@ -6,41 +6,14 @@ file and the measurements of the emulated hardware. Takes five to seven minutes 
 """
 
 import argparse
-import random
-from dataclasses import replace
 from pathlib import Path
 
 import carlab
 from carlab.cars import CarFile
-from carlab.core.geofence import rectangle
-from carlab.core.policy import PolicyInput
-from carlab.core.task import RecordedTask
 
 CONCEALED = {"effects.steering_lag.time_constant": 0.07, "motor.drive_gain": 6.8}
 UNITS = {"effects.steering_lag.time_constant": "s", "motor.drive_gain": "N"}
-HALL = RecordedTask(carlab.CarState(), max_ticks=600, arena_m=rectangle(-15.0, 15.0, -15.0, 15.0))
-
-
-class Excitation:
-    """Random steps of steering and throttle at random times, different in each episode."""
-
-    name = "excitation"
-
-    def __init__(self) -> None:
-        self.random = random.Random(0)
-        self.reset()
-
-    def reset(self) -> None:
-        self.next_s, self.action = [0.0, 0.0], carlab.NEUTRAL
-
-    def act(self, view: PolicyInput) -> carlab.Action:
-        if view.elapsed_s >= self.next_s[0]:
-            self.next_s[0] += self.random.uniform(0.3, 0.9)
-            self.action = replace(self.action, steering=self.random.uniform(-0.9, 0.9))
-        if view.elapsed_s >= self.next_s[1]:
-            self.next_s[1] += self.random.uniform(0.8, 2.0)
-            self.action = replace(self.action, throttle=self.random.uniform(0.05, 0.5))
-        return self.action
+DRIVE_TICKS = 600
 
 
 def progress_hooks() -> carlab.LearnHooks:
@@ -99,10 +72,11 @@ def main() -> None:
     )  # fmt: skip
     if not learned.is_complete:
         raise SystemExit(f"The run ended early; resume it with carlab learn --resume {learned.folder}")
-    print("Recording two drives with steps of steering and throttle, 20 s each; the second is held out")
+    print("Recording two drives with random commands, 20 s each; the second is held out")
     drive = carlab.drive(
-        options.car, reality=reality, policy=Excitation(), task=HALL, episodes=2, out=options.out, name="excitation"
-    )
+        options.car, reality=reality, policy="excitation", ticks=DRIVE_TICKS, episodes=2, out=options.out,
+        name="excitation",
+    )  # fmt: skip
     if len(drive.recordings) < 2:
         raise SystemExit(f"The drive ended early: {'nothing was driven' if drive.end is None else drive.end.value}")
     print("Diagnosing")

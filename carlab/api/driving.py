@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 KEY_THROTTLE = 0.4
 TELEOP_MAX_TICKS = 10**6
+EXCITATION, EXCITATION_S = "excitation", 60.0
+"""Name of the policy, and duration [s] of an episode with it."""
 
 
 def drive(
@@ -55,15 +57,15 @@ def drive(
 
     Args:
         car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
-        policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
-            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
+        policy: ``parking`` (feedback), ``excitation`` (random commands), a manoeuvre, ``neutral``, ``keyboard``,
+            ``gamepad``, folder of a ``carlab.learn`` run or of its model, or a ``carlab.core.policy.Policy``.
         task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
             Without it, a manoeuvre of a simulated or emulated car has no arena.
         track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
         episodes: number of episodes.
-        ticks: control periods per episode; by default the task's number, a whole manoeuvre, or for ``keyboard`` and
-            ``gamepad`` no limit.
-        seed: of start poses and sensor noise.
+        ticks: control periods per episode; by default the task's number, a whole manoeuvre, a minute of ``excitation``,
+            or for ``keyboard`` and ``gamepad`` no limit.
+        seed: of start poses, sensor noise and the commands of ``excitation``.
         max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
         place: start each episode at the task's start pose; False: at the car's current pose.
         out: parent of the run's folder, whose result.json is written after each episode.
@@ -191,11 +193,10 @@ def _drive(
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.experiment.episodes.session import Session
 
-    driver, teleop = _policy(policy, max_throttle, choice.simulator)
-    if isinstance(policy, str) and policy in MANOEUVRES and options["max_ticks"] is None:
-        # One tick more than the manoeuvre, so that the script ends the episode.
-        whole = math.ceil(MANOEUVRES[policy]().duration_s / choice.control_period_s) + 1
-        options = {**options, "max_ticks": whole}
+    envelope = _envelope(choice.envelope, task, max_throttle)
+    driver, teleop = _policy(policy, max_throttle, choice.simulator, envelope, options["seed"])
+    if options["max_ticks"] is None:
+        options = {**options, "max_ticks": _ticks(policy, choice.control_period_s)}
     session_hooks = hooks.session()
     with contextlib.ExitStack() as signals, contextlib.ExitStack() as stack:
         if teleop is not None:
@@ -204,7 +205,6 @@ def _drive(
             stack.enter_context(teleop)
         stack.enter_context(choice.car)
         signals.enter_context(Interrupts())
-        envelope = _envelope(choice.envelope, task, max_throttle)
         session = Session(
             choice.car, driver, task, envelope, run, choice.control_period_s, config_toml=choice.config_toml,
             hooks=session_hooks, **options,
@@ -212,8 +212,18 @@ def _drive(
         return session.drive(episodes)
 
 
+def _ticks(policy: str | Policy, period_s: float) -> int | None:
+    """Ticks of a manoeuvre or of excitation; None for other policies."""
+    if policy == EXCITATION:
+        return round(EXCITATION_S / period_s)
+    if isinstance(policy, str) and policy in MANOEUVRES:
+        # One tick more than the manoeuvre, so that the script ends the episode.
+        return math.ceil(MANOEUVRES[policy]().duration_s / period_s) + 1
+    return None
+
+
 def _policy_names() -> tuple[str, ...]:
-    return ("parking", "neutral", "keyboard", "gamepad", *MANOEUVRES)
+    return ("parking", EXCITATION, "neutral", "keyboard", "gamepad", *MANOEUVRES)
 
 
 def _check(
@@ -299,9 +309,10 @@ def _envelope(car_limits: SafetyEnvelope, task: Task, max_throttle: float | None
 
 
 def _policy(
-    policy: str | Policy, max_throttle: float | None, simulator: SimulatorConfig
+    policy: str | Policy, max_throttle: float | None, simulator: SimulatorConfig, envelope: SafetyEnvelope, seed: int
 ) -> tuple[Policy, TeleopPolicy | None]:
     """The policy, and the same object as a TeleopPolicy if a person drives (else None)."""
+    from carlab.experiment.episodes.excitation_policy import ExcitationPolicy
     from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy, NeutralPolicy, ReverseParkingPolicy
     from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 
@@ -315,6 +326,8 @@ def _policy(
         return teleop, teleop
     if policy == "neutral":
         return NeutralPolicy(), None
+    if policy == EXCITATION:
+        return ExcitationPolicy(simulator, envelope, seed), None
     if policy == "parking":
         return ReverseParkingPolicy.for_car(simulator), None
     return ManoeuvrePolicy(MANOEUVRES[policy]()), None

@@ -37,19 +37,20 @@ class Drive:
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     policy: str = "parking"
-    """parking (feedback), neutral (no motion), keyboard or gamepad (hold the dead-man control), a scripted manoeuvre
-    (steering_steps, throttle_steps, steering_chirp, figure_eight, throttle_ramp, coast_down, slow_circle), or the
-    run folder of carlab learn: its newest policy (RUN/models/0003: the policy of episode 3)."""
+    """parking (feedback), excitation (random commands inside the arena, for a diagnosis), neutral (no motion), keyboard
+    or gamepad (hold the dead-man control), a scripted manoeuvre (steering_steps, throttle_steps, steering_chirp,
+    figure_eight, throttle_ramp, coast_down, slow_circle), or the run folder of carlab learn: its newest policy
+    (RUN/models/0003: the policy of episode 3)."""
 
     episodes: int = 1
     """Number of episodes."""
 
     ticks: int | None = None
-    """Ticks per episode. By default the task's number (parking: 100); for a scripted manoeuvre its duration; with
-    keyboard or gamepad no limit."""
+    """Ticks per episode. By default the task's number (parking: 100); for a scripted manoeuvre its duration; for
+    excitation a minute; with keyboard or gamepad no limit."""
 
     seed: int = 0
-    """Seed of start poses and sensor noise."""
+    """Seed of start poses, sensor noise, and the commands of excitation."""
 
     max_throttle: float | None = None
     """Upper limit of the throttle in the safety gate, in (0, 1]."""

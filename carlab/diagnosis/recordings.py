@@ -144,7 +144,7 @@ def check_excitation(segments: Sequence[RecordingSegment], settings: WindowSetti
         raise Inconclusive(
             f"The recordings to fit contain {seconds:.1f} s of driving (without parts that are held out). A diagnosis "
             f"needs at least {settings.min_fit_s:.0f} s, better 100 s, with changing speed and steering, for example "
-            "carlab drive --policy gamepad --ticks 3600, or --episodes 30 of the parking policy."
+            "carlab drive --policy excitation --episodes 2."
         )
     speed = np.concatenate([np.hypot(t.smooth[:, 3], t.smooth[:, 4]) for t in segments])
     if np.quantile(speed, 0.9) < settings.min_speed_mps:
