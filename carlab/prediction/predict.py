@@ -6,7 +6,7 @@ Times are those of the recording, in which commands act later by the latency of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -20,7 +20,7 @@ from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.inputs import with_effects_of_values
 from sim_backends.batch.rollout import Engine, rollout
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import EFFECTS, DynamicsEffect
 from sim_backends.measurement import (
     COMMAND_DELAY,
     MeasurementModel,
@@ -140,11 +140,13 @@ def simulate_windows(
 
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
     start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
+    earlier = _past_of_hidden_states(windows, measurement, effects, sets)
     states = rollout(
         unmeasured,
         tensor(start.reshape(-1, 6)),
         tensor(np.tile(windows.commands, (sets, 1, 1))),
         history=tensor(np.tile(windows.past_commands, (sets, 1, 1))),
+        history_states=None if earlier is None else tensor(earlier),
         values={name: tensor(np.broadcast_to(v, (sets, count)).reshape(-1)) for name, v in inner.items()},
         t0_s=tensor(np.tile(windows.t0_s, sets)),
         max_step_s=max_step_s,
@@ -153,6 +155,17 @@ def simulate_windows(
     rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
     trajectory: list[State] = [tuple(tick) for tick in rows.reshape(windows.steps + 1, 6, sets, count)]
     return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
+
+
+def _past_of_hidden_states(
+    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str], sets: int
+) -> FloatArray | None:
+    """True states (P S, H, 6) before windows, on which hidden states of the body depend; None without such states."""
+    used = [EFFECTS[name] for name in effects]
+    if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in used):
+        return None
+    past = [measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)]
+    return _stacked(past, sets).reshape(-1, len(past), 6)
 
 
 def _measured(
