@@ -11,9 +11,10 @@ from typing import Any, Self
 
 from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys, number
+from sim_backends.array_ops import FLOATS
 from sim_backends.effects import EFFECTS, DelayEffect, MeasuredCurve
 from sim_backends.effects.base import GRAVITY_MPS2, MODEL_KINDS, ModelKind
-from sim_backends.measurement import LATENCY
+from sim_backends.measurement import LATENCY, MeasurementModel
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
 TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
@@ -158,6 +159,10 @@ class SimulatorConfig:
                 steering_s += extra_steering_s
                 throttle_s += extra_throttle_s
         return steering_s, throttle_s
+
+    def latency_s(self) -> float:
+        """Latency of motion capture with all effects [s]."""
+        return float(MeasurementModel(FLOATS, self.values(), self.effects).latency_s)
 
     @classmethod
     def from_tables(cls, tables: Mapping[str, Any], where: str = "the car file") -> Self:

@@ -10,9 +10,7 @@ import numpy as np
 
 from carlab.core.angles import wrap
 from carlab.core.quantities import PoseSample
-from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.measurement import MeasurementModel
 from sim_backends.plant import Pose
 
 
@@ -37,7 +35,7 @@ class MocapSensor:
 
     def __init__(self, config: SimulatorConfig, seed: int = 0, *, extra_latency_s: float = 0.0) -> None:
         self._mocap = config.mocap
-        self.latency_s: float = MeasurementModel(FLOATS, config.values(), config.effects).latency_s + extra_latency_s
+        self.latency_s = config.latency_s() + extra_latency_s
         self.lost = 0
         self._rng = np.random.default_rng(seed)
         self._start_s = 0.0

@@ -61,7 +61,7 @@ def compare(
     for name in candidates:
         if name not in known:
             raise ConfigError(f"'{name}' cannot change in this car; {nearest_name(name, known)}")
-    latency_s = file.simulator.mocap.latency_s
+    latency_s = file.simulator.latency_s()
     groups = [read(items, role, latency_s) for items, role in ((first, "first group"), (second, "second group"))]
     found = search(
         groups[0].episodes,

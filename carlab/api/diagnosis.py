@@ -196,7 +196,7 @@ def _read_recordings(
     """Recordings to fit and held-out ones. Raises ConfigError for arguments that exclude each other."""
     to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
     _check_share(holdout_share, to_validate)
-    latency_s = car.simulator.mocap.latency_s
+    latency_s = car.simulator.latency_s()
     return load_recordings(to_fit, "fit", latency_s), load_recordings(to_validate, "held out", latency_s)
 
 

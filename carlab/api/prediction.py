@@ -167,7 +167,7 @@ def predict(
     from carlab.diagnosis.score_recording import score_recording
 
     file = load_car(car)
-    loaded = load_recordings(as_list(recording), "scored", file.simulator.mocap.latency_s)
+    loaded = load_recordings(as_list(recording), "scored", file.simulator.latency_s())
     score = score_recording(
         loaded.episodes,
         file.simulator,

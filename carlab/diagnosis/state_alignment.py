@@ -2,7 +2,7 @@
 
 A control loop uses the newest pose, whose age varies with the phase of motion capture, and velocities of a line through
 earlier poses, which are older. Both ages and all poses are recorded. A local quadratic through the poses gives the
-state at the tick minus the latency of motion capture in the car file. The difference between a velocity column and the
+state at the tick minus the simulator's latency of motion capture. The difference between a velocity column and the
 line through its poses (the effect of a filter after the estimator) is added to the velocity.
 """
 
@@ -36,7 +36,7 @@ def align_states(episode: EpisodeData, latency_s: float) -> EpisodeData:
 
     Args:
         episode: as read; returned unchanged if it lacks the ages of its poses and velocities.
-        latency_s: latency of motion capture in the car file.
+        latency_s: latency of motion capture of the simulator.
 
     Returns:
         The episode without the first and last rows that lack poses on one side. Inner rows with too few poses nearby

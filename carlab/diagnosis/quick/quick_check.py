@@ -108,7 +108,7 @@ def quick_check(
     usable = [e for e in episodes if e.ticks >= 2]
     if not usable:
         return replace(undecided, why="they contain no commands.")
-    captured = [align_states(e, simulator.mocap.latency_s) for e in usable]
+    captured = [align_states(e, simulator.latency_s()) for e in usable]
     simulator = with_known_latency(simulator, captured)
     repaired, _, faults = data_faults.check(captured, [], simulator)
     unusable = [f for f in faults if f.action.startswith("unusable")]
@@ -138,7 +138,7 @@ def held_out_loss(
         One loss for each simulator; None if the car moves in no window.
     """
     first = simulators[0]
-    captured = [align_states(episode, first.mocap.latency_s)] if episode.ticks >= 2 else []
+    captured = [align_states(episode, first.latency_s())] if episode.ticks >= 2 else []
     repaired, _, _ = data_faults.check(captured, [], with_known_latency(first, captured))
     try:
         windows, floor = _windows(repaired, first, window_variance_s2([episode]), settings)

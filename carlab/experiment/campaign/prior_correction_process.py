@@ -152,7 +152,7 @@ def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorCo
     from carlab.diagnosis.state_alignment import align_states
     from sim_backends.effects import confusable_effects
 
-    aligned = [align_states(e, car.mocap.latency_s) for e in episodes]
+    aligned = [align_states(e, car.latency_s()) for e in episodes]
     held_out = aligned[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
     fit = [e for k, e in enumerate(aligned) if k % HELD_OUT_EVERY != HELD_OUT_EVERY - 1]
     texts = Texts(effect_sentence, separating_drive, confusable_effects())

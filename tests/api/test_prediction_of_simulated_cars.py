@@ -1,0 +1,21 @@
+"""A simulator predicts the recordings of the simulated car that has its own parameters."""
+
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+
+import carlab
+from sim_backends.car_parameters import MocapParameters, SimulatorConfig
+
+
+def test_latency_of_an_effect_is_that_of_the_recorded_states(tmp_path: Path) -> None:
+    """Otherwise the states are 42 ms younger than the simulator assumes, and the position errs by 2 cm."""
+    quiet = MocapParameters(position_std_m=1e-5, yaw_std_rad=1e-4)
+    config = SimulatorConfig(mocap=quiet, effects={"mocap_latency": {"latency": 0.05}})
+    car = tmp_path / "late.toml"
+    car.write_text(tomli_w.dumps(config.to_tables()))
+    run = carlab.drive(car, policy="figure_eight", ticks=240, out=tmp_path, rerun=False, picture=False)
+    errors = carlab.predict(run.recordings, car, horizon_s=0.8).score.whole.errors["model"]
+    assert len(errors) > 5
+    assert np.sqrt(np.mean(errors**2, axis=0))[:3].max() < 5e-4, errors
