@@ -13,19 +13,17 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.prediction.predict import MAX_STEP_S
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.dynamics.integrate import MAX_STEP_S
 
 MAX_WINDOWS = 64
 HORIZON_S = 1.0
 
 
-def check_integration(
-    fit: Sequence[EpisodeData], nominal: SimulatorConfig, max_step_s: float = MAX_STEP_S
-) -> list[DataFault]:
-    """Compare the difference of predictions at ``max_step_s`` and at a quarter of it with the noise, by channel.
+def check_integration(fit: Sequence[EpisodeData], nominal: SimulatorConfig) -> list[DataFault]:
+    """Compare the difference of predictions at their usual step and at a quarter of it with the noise, by channel.
 
     The difference is the root mean square after 1 s without the tenth of the windows with the largest differences,
     because a spinning car amplifies all errors. Returns an empty list without windows.
@@ -40,7 +38,7 @@ def check_integration(
     windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, MAX_WINDOWS).round().astype(np.int64)))
     noise = estimate_noise(segments, windows.curvature_bias).measured
     with np.errstate(all="ignore"):  # a step that is far too coarse overflows
-        difference = np.abs(_ends(windows, nominal, max_step_s) - _ends(windows, nominal, 0.25 * max_step_s))
+        difference = np.abs(_ends(windows, nominal, MAX_STEP_S) - _ends(windows, nominal, 0.25 * MAX_STEP_S))
     difference = np.where(np.isfinite(difference), difference, np.inf)
     difference_rms = np.sqrt(np.mean(np.sort(difference, axis=0)[: max(round(0.9 * len(windows)), 1)] ** 2, axis=0))
     return [
