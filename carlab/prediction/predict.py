@@ -140,10 +140,11 @@ def simulate_windows(
 
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
     start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
-    earlier = _past_of_hidden_states(windows, measurement, effects, sets)
+    origin = _origins(start, effects)
+    earlier = _past_of_hidden_states(windows, measurement, effects, origin)
     states = rollout(
         unmeasured,
-        tensor(start.reshape(-1, 6)),
+        tensor((start - origin).reshape(-1, 6)),
         tensor(np.tile(windows.commands, (sets, 1, 1))),
         history=tensor(np.tile(windows.past_commands, (sets, 1, 1))),
         history_states=None if earlier is None else tensor(earlier),
@@ -153,19 +154,33 @@ def simulate_windows(
         engine=engine,
     ).states
     rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
-    trajectory: list[State] = [tuple(tick) for tick in rows.reshape(windows.steps + 1, 6, sets, count)]
+    rows = rows.reshape(windows.steps + 1, 6, sets, count) + np.moveaxis(origin, -1, 0)
+    trajectory: list[State] = [tuple(tick) for tick in rows]
     return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
 
 
 def _past_of_hidden_states(
-    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str], sets: int
+    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str], origin: FloatArray
 ) -> FloatArray | None:
-    """True states (P S, H, 6) before windows, on which hidden states of the body depend; None without such states."""
+    """True states (P S, H, 6) before windows, less ``origin`` (P, S, 6); None if no hidden state depends on them."""
     used = [EFFECTS[name] for name in effects]
     if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in used):
         return None
     past = [measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)]
-    return _stacked(past, sets).reshape(-1, len(past), 6)
+    states = _stacked(past, len(origin)) - origin[:, :, None]
+    return states.reshape(-1, len(past), 6)
+
+
+def _origins(start: FloatArray, effects: Iterable[str]) -> FloatArray:
+    """Positions and whole turns (P, S, 6) to subtract from states (P, S, 6), which 32 bits resolve near 0 only.
+
+    Positions are 0 if an effect depends on the place.
+    """
+    origin = np.zeros_like(start)
+    if not any("place" in EFFECTS[name].depends_on for name in effects):
+        origin[..., :2] = start[..., :2]
+    origin[..., 2] = 2.0 * np.pi * np.round(start[..., 2] / (2.0 * np.pi))
+    return origin
 
 
 def _measured(

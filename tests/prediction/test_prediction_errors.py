@@ -259,3 +259,14 @@ def test_learned_car_predicts_the_mean_of_sampled_paths():
     np.testing.assert_allclose(found[..., :2], steady[..., :2], atol=0.06)
     with pytest.raises(DataError, match="past commands"):
         LearnedModel(type("Long", (SteadyCar,), {"history": 99})()).predict(windows)
+
+
+@pytest.mark.parametrize("effects", [{}, {"tyre_relaxation": {"length": 0.1}}])
+def test_prediction_is_independent_of_the_origin_and_of_whole_turns(even, effects):
+    """Metric coordinates of a map are millions of metres, which 32 bits resolve to half a metre."""
+    windows, config = recorded_windows(even), replace(CONFIG, effects=effects)
+    shift = np.array([5e5, 5.4e6, 2.0 * np.pi * 1000, 0.0, 0.0, 0.0])
+    arrays = ("initial_states", "past_states", "measured")
+    moved = replace(windows, **{name: getattr(windows, name) + shift for name in arrays})
+    found = SimulatorModel(config).predict(moved) - shift
+    np.testing.assert_allclose(found, SimulatorModel(config).predict(windows), atol=2e-5)
