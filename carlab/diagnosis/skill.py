@@ -11,7 +11,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Skill
 from carlab.diagnosis.identification.fit import clustered_gain
 from carlab.diagnosis.settings import EvidenceSettings
-from carlab.prediction.windows import PredictionWindows
+from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, history_rows
 
 
 def skill_of(
@@ -37,7 +37,8 @@ def skill_of(
 def _regimes(windows: PredictionWindows, own: NDArray[np.bool_]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """All windows of a recording, those with the smaller and the larger change of the commands, slow and fast ones."""
     yield "all", own
-    commands = np.concatenate([windows.past_commands, windows.commands], axis=1)
+    recent = windows.past_commands[:, -history_rows(windows.period_s, MIN_HISTORY_S) :]
+    commands = np.concatenate([recent, windows.commands], axis=1)
     change = np.hypot(*np.moveaxis(np.ptp(commands, axis=1), -1, 0))
     speed = np.abs(windows.initial_states[:, 3])
     for size, low, high in ((change, "steady commands", "changing commands"), (speed, "low speed", "high speed")):

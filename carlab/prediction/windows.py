@@ -25,8 +25,11 @@ IndexArray = NDArray[np.int64]
 
 SMOOTHING_SPAN_S = 0.27
 """Span of the poses that the initial state of a window is estimated from: nine poses at 30 Hz."""
-HISTORY_S = 0.6
-"""Length of the commands before a window: six time constants of a slow (0.1 s) servo or motor."""
+MIN_HISTORY_S = 0.6
+"""Minimum time of a stretch before a window: six time constants of a usual (0.1 s) servo or motor."""
+HISTORY_S = 1.2
+"""Length of the commands and states before a window. Play in the steering, spinning wheels and slow tyres, servos and
+motors depend on more than ``MIN_HISTORY_S``; before the stretch its first command and state were held."""
 MIN_QUINTIC_WIDTH = 7
 """Minimum number of poses of the local quintic that is compared with the cubic."""
 MAX_PERIOD_S = 0.034
@@ -95,10 +98,10 @@ class PredictionWindows:
         period_s: length of a step.
         initial_states: (S, 6) x, y [m], yaw [rad] in the recording's frame, vx, vy [m/s] in the body frame, yaw rate
             [rad/s]; other states have the same columns.
-        past_commands: (S, H, 2) steering and throttle before the window.
+        past_commands: (S, H, 2) steering and throttle before the window; before the stretch its first ones.
         commands: (S, K, 2) steering and throttle in the window.
         measured: (S, K + 1, 6) states as recorded, yaw unwrapped.
-        past_states: (S, H, 6) smoothed states before the window.
+        past_states: (S, H, 6) smoothed states before the window; before the stretch its first one.
         curvature_bias: (S, 6) initial state by a local quintic minus that by the local cubic.
         t0_s: (S,) start of the window since the first row of its recording.
         recording: (S,) index of the recording.
@@ -276,6 +279,16 @@ def smoothing_width(period_s: float) -> int:
     return max(2 * round((SMOOTHING_SPAN_S / period_s - 1) / 2) + 1, 5)
 
 
+def history_rows(period_s: float, seconds: float = HISTORY_S) -> int:
+    """Number of rows in a time before a window."""
+    return max(round(seconds / period_s), 1)
+
+
+def _before(values: FloatArray, row: int, period_s: float) -> FloatArray:
+    """The rows (H, ...) before ``row``, with the first one where there are too few."""
+    return values[np.maximum(np.arange(row - history_rows(period_s), row), 0)]
+
+
 def cut_windows(
     segments: Sequence[RecordingSegment],
     horizon_s: float,
@@ -301,26 +314,25 @@ def cut_windows(
     period_s = segments[0].period_s
     steps = max(round(horizon_s / period_s), 1)
     stride = max(round(stride_s / period_s), 1)
-    past = max(round(HISTORY_S / period_s), 1)
     starts = [
         (segment, row)
         for segment in segments
-        for row in range(past, len(segment.t_s) - steps, stride)
+        for row in range(history_rows(period_s, MIN_HISTORY_S), len(segment.t_s) - steps, stride)
         if np.hypot(*segment.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
         and (with_events or not segment.in_event[row : row + steps + 1].any())
     ]
     if not starts:
         raise DataError(
-            f"The car moves in no stretch of {horizon_s + HISTORY_S:.1f} s; record a longer drive, or choose "
+            f"The car moves in no stretch of {horizon_s + MIN_HISTORY_S:.1f} s; record a longer drive, or choose "
             "a shorter horizon."
         )
     return PredictionWindows(
         period_s=period_s,
         initial_states=np.stack([segment.smooth[row] for segment, row in starts]),
-        past_commands=np.stack([segment.commands[row - past : row] for segment, row in starts]),
+        past_commands=np.stack([_before(segment.commands, row, period_s) for segment, row in starts]),
         commands=np.stack([segment.commands[row : row + steps] for segment, row in starts]),
         measured=np.stack([segment.states[row : row + steps + 1] for segment, row in starts]),
-        past_states=np.stack([segment.smooth[row - past : row] for segment, row in starts]),
+        past_states=np.stack([_before(segment.smooth, row, period_s) for segment, row in starts]),
         curvature_bias=np.stack([segment.curvature_bias[row] for segment, row in starts]),
         t0_s=np.array([segment.t_s[row] for segment, row in starts]),
         recording=np.array([segment.recording for segment, _ in starts]),

@@ -29,7 +29,7 @@ from carlab.diagnosis.state_alignment import align_states, window_variance_s2, w
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows, segments_of
+from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 
 SCHEMA = "carlab.light_diagnosis/1"
@@ -117,7 +117,7 @@ def quick_check(
     try:
         windows, floor = _windows(repaired, simulator, window_variance_s2(usable), settings)
     except DataError:
-        length_s = settings.window_s + HISTORY_S
+        length_s = settings.window_s + MIN_HISTORY_S
         return replace(undecided, why=f"the car moves in no stretch of {length_s:.1f} s.")
     if len(windows) < settings.min_windows:
         return replace(undecided, why=f"the car moves in only {len(windows)} windows of {settings.window_s:.1f} s.")

@@ -17,7 +17,7 @@ from carlab.diagnosis.settings import ReportSettings
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import predicted_at, simulate_windows
-from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
+from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, RecordingSegment, cut_windows, history_rows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 
@@ -70,7 +70,8 @@ def _correlation(
     step = min(max(round(settings.correlation_step_s / windows.period_s), 1), windows.steps)
     column = 3 if on_throttle else 5
     missing = -error[:, step, column] / (step * windows.period_s)
-    command = windows.past_commands[:, :, 1 if on_throttle else 0]
+    recent = windows.past_commands[:, -history_rows(windows.period_s, MIN_HISTORY_S) :]
+    command = recent[:, :, 1 if on_throttle else 0]
     lags = np.arange(0, command.shape[1] - 1)
     values = []
     for lag in lags:
