@@ -87,12 +87,12 @@ class LearnedModel:
     def sample(self, windows: PredictionWindows) -> FloatArray:
         """Paths (S, K + 1, n_samples, 6), yaw continuous with that of the windows. Raises DataError as ``predict``."""
         past = past_commands(windows, self.dynamics.history)
-        paths = sample_paths(
-            self.dynamics, windows.initial_states, past, windows.commands, n_samples=self.n_samples, seed=self.seed
-        )
+        start = windows.initial_states[:, None, None]
+        at_origin = windows.initial_states * [0.0, 0.0, 1.0, 1.0, 1.0, 1.0]  # 32 bits resolve positions near 0 only
+        paths = sample_paths(self.dynamics, at_origin, past, windows.commands, n_samples=self.n_samples, seed=self.seed)
+        paths[..., :2] += start[..., :2]
         # Angles are encoded by sine and cosine; the recording's yaw is unwrapped.
-        turns = np.round((windows.initial_states[:, 2, None] - paths[:, 0, :, 2]) / (2 * np.pi))
-        paths[..., 2] += 2 * np.pi * turns[:, None]
+        paths[..., 2] += 2 * np.pi * np.round((start[..., 2] - paths[:, :1, :, 2]) / (2 * np.pi))
         return paths
 
 

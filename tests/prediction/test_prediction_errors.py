@@ -257,6 +257,8 @@ def test_learned_car_predicts_the_mean_of_sampled_paths():
     np.testing.assert_allclose(found[..., 2], steady[..., 2], atol=1e-3)
     np.testing.assert_allclose(found[:, -1, 3], 1.0, atol=5 * 0.01 * np.sqrt(30 / 200))
     np.testing.assert_allclose(found[..., :2], steady[..., :2], atol=0.06)
+    far = replace(windows, initial_states=windows.initial_states + np.array([5e5, 5.4e6, 0, 0, 0, 0]))
+    np.testing.assert_allclose(model.predict(far)[..., :2] - found[..., :2] - [5e5, 5.4e6], 0.0, atol=1e-6)
     with pytest.raises(DataError, match="past commands"):
         LearnedModel(type("Long", (SteadyCar,), {"history": 99})()).predict(windows)
 
