@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import os
 import re
@@ -100,6 +101,7 @@ def _effect(effect: Any) -> str:
         links.append(f"[`{name}`](#{name}){drive}")
     return (
         f"## `{effect.id}` {{ #{effect.id} }}\n\n{effect.summary} In reports: {effect.name}.\n\n"
+        f"{inspect.getdoc(type(effect))}\n\n"
         f"| parameter | unit | identity | range | typical |\n| --- | --- | --- | --- | --- |\n{rows}\n\n"
         f"Kind: {effect.kind}. Confusable with: {', '.join(links) or 'none'}.\n\n{shown}"
     )

@@ -35,7 +35,7 @@ class FirstOrderLag(ActuatorEffect):
 
 
 class SteeringLag(FirstOrderLag):
-    """The wheel angle follows the steering servo's command with a lag."""
+    """``time_constant dd/dt = d_cmd - d``."""
 
     id = "steering_lag"
     fitted_with_curves = True
@@ -66,7 +66,7 @@ class SteeringLag(FirstOrderLag):
 
 
 class MotorLag(FirstOrderLag):
-    """The drive force follows the throttle with a lag."""
+    """``time_constant du/dt = u_t - u``."""
 
     id = "motor_lag"
     fitted_with_curves = True

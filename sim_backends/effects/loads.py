@@ -70,7 +70,7 @@ class RollDynamics(DynamicsEffect):
     ``rho`` is the share of the load that has moved from the inner to the outer wheels, 1 where all of the grip is used:
     ``rho'' + 2 damping w rho' + w^2 rho = w^2 ay / (mu g)``, ``w = 2 pi frequency``, with ay of the side forces and
     ``mu g = (mu_f F_z,f + mu_r F_z,r) / m``. By the tyres' load sensitivity both axles keep ``1 - sensitivity rho^2``
-    of their side force. Above ``MAX_ROLL_HZ`` the loss fades, so that an infinite frequency is the base model.
+    of their side force. Above 25 Hz the loss fades, so that an infinite frequency is the base model.
     Source: roll and load sensitivity of Milliken and Milliken 1995, "Race Car Vehicle Dynamics".
     """
 

@@ -106,7 +106,7 @@ class FrictionDrift(DynamicsEffect):
 class LowFrictionPatch(DynamicsEffect):
     """``mu (1 - loss)`` of both axles while the centre of mass is inside a disc around (x, y).
 
-    The loss grows in a straight line over ``RIM_WIDTH_M`` across the rim.
+    The loss grows in a straight line over 5 cm across the rim.
     """
 
     id = "low_friction_patch"

@@ -32,7 +32,8 @@ class LongitudinalSlip(DynamicsEffect):
     ``F_x = mu F_z,rear tanh(stiffness slip / (mu F_z,rear))``: ``stiffness`` [N] is the slope at zero slip, the rear
     axle's friction the limit (slope and limit are those of the brush model, Pacejka 2012, "Tire and Vehicle Dynamics",
     ch. 3; the tanh between them is our choice). ``inertia`` [kg m2] is that of all driven wheels and what turns with
-    them. Without inertia it is the base model: the force of the motor arrives whole and at once.
+    them, with wheels of radius R = 0.033 m. Without inertia it is the base model: the force of the motor arrives whole
+    and at once.
 
     The state is the slip speed ``s = R w - vx``. Its eigenvalue, ``(R^2/J + 1/m) stiffness / max(|vx|, 0.3)``, is
     thousands per second, so each Runge-Kutta step takes the pair (s, vx), all other forces held, by the implicit Euler

@@ -227,7 +227,15 @@ def test_site_builds_without_warnings(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "site" / "reference" / "cli.html").is_file()
+    reference = tmp_path / "site" / "reference"
+    assert (reference / "cli.html").is_file()
+    effects = (reference / "effects.html").read_text(encoding="utf-8")
+    for equation in (
+        "time_constant dd/dt = d_cmd - d",
+        "d = d_cmd - clip(d_cmd, -width/2, width/2)",
+        "M -= coefficient r",
+    ):
+        assert equation in effects
 
 
 def test_page_about_a_new_car_lists_its_interface() -> None:
