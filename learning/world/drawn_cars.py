@@ -20,10 +20,11 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_history, decode_state, encode, push_action
 from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import whole_steps
+from sim_backends.array_ops import FLOATS
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import LATENCY, SimulatorConfig
 from sim_backends.effects import CATALOGUE, Effect
-from sim_backends.measurement import COMMAND_DELAY
+from sim_backends.measurement import COMMAND_DELAY, MeasurementModel
 from sim_backends.registry import REGISTRY
 
 HISTORY = 8
@@ -111,7 +112,8 @@ def draw_cars(prior: SimulatorConfig, count: int, generator: torch.Generator, hi
             value = value * torch.exp(PARAMETER_SPREAD * torch.randn(count, generator=generator))
         values[name] = value.clamp(max(info.low, 1e-6) if info.positive else info.low, info.high)
     delay_s = values.get(COMMAND_DELAY, torch.full((count,), prior.command_delay_s))
-    values[COMMAND_DELAY] = delay_s + values.pop(LATENCY, torch.full((count,), prior.mocap.latency_s))
+    values[COMMAND_DELAY] = delay_s + MeasurementModel(FLOATS, {**prior.values(), **values}, prior.effects).latency_s
+    values.pop(LATENCY, None)
     unknown = [e for e in CATALOGUE.values() if e.id not in prior.effects and _is_plausible(e, prior)]
     for effect in unknown:
         values[f"effects.{effect.id}.{effect.parameters[0].name}"] = _sizes(

@@ -63,6 +63,15 @@ def test_rollouts_have_the_past_commands_of_the_caller(history: int) -> None:
     torch.testing.assert_close(decode_state(after)[:, :2], expected.states[:, 1, :2])
 
 
+def test_commands_act_later_by_the_latency_of_an_effect() -> None:
+    """The policy sees states that are 50 ms old."""
+    quick = replace(CAR, priors={}, command_delay_s=0.02, effects={"mocap_latency": {"latency": 0.05}})
+    for prior, delay_s in ((quick, 0.07), (replace(quick, effects={}), 0.02 + CAR.mocap.latency_s)):
+        known = replace(prior, parameter_std={"timing.command_delay": 1e-9})
+        cars = draw_cars(known, 20, torch.Generator().manual_seed(0))
+        assert float(cars.values["timing.command_delay"].median()) == pytest.approx(delay_s, abs=2e-3)
+
+
 def test_most_unknown_effects_are_absent_and_the_others_are_plausible() -> None:
     cars = draw_cars(CAR, 4000, torch.Generator().manual_seed(0))
     lag = cars.values[LAG]
