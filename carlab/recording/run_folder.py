@@ -4,7 +4,7 @@ runs/2026-11-21_134500_<name>/
     config.toml          the car file of the run
     environment.json     program, git, packages, host, start
     episodes/0001.mcap   one recording per episode, also as 0001.rrd
-    episodes/stopped/    episodes of a learning run that a person ended; they are driven again
+    episodes/stopped/    episodes of a learning run that a person ended or that have no tick; they are driven again
     models/0001/         learned models and policies of a learning run
     log.jsonl            the program's log, one JSON object per line
     result.json          the result of the run
@@ -128,7 +128,7 @@ class RunDirectory:
 
     @property
     def stopped(self) -> Path:
-        """Folder of the recordings of episodes that a person ended; it may be missing."""
+        """Folder of the recordings of episodes that are driven again; it may be missing."""
         return self.episodes / "stopped"
 
     @property

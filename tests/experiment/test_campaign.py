@@ -20,7 +20,7 @@ from learning_runs import HISTORY, TICKS, InterruptedRun, drive, log_sent_action
 import carlab
 from carlab.cars import choose_car
 from carlab.core.documents import EpisodeEnded, Tick
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, NotReadyError
 from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import CarState, Reality
@@ -262,6 +262,29 @@ def test_interrupted_episode_is_kept_and_repeated(interrupted: InterruptedRun, t
     assert (result.data.ticks, result.reason, figures[0].episode) == (TICKS, EndReason.COMPLETED, 1)
 
 
+def test_episode_of_a_car_that_cannot_be_armed_is_repeated(
+    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = RunDirectory.create(tmp_path, "not-ready")
+    shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
+    choice = choose_car("sim", seed=0)
+    figures: list[EpisodeFigures] = []
+    hooks = CampaignHooks(on_figures=figures.append)
+    campaign = Campaign(choice, interrupted.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
+
+    def refuse() -> None:
+        raise NotReadyError("car", ["it moves"])
+
+    with choice.car, monkeypatch.context() as patch:
+        patch.setattr(choice.car, "arm", refuse)
+        with pytest.raises(NotReadyError, match="it moves"):
+            list(campaign.run_episodes())
+        patch.undo()
+        (result,) = campaign.run_episodes()
+    assert (result.data.ticks, figures[0].episode, figures[0].rows) == (TICKS, 1, 0)
+    assert [p.name for p in run.recordings()] == ["0002.mcap"]
+
+
 def test_hung_episode_is_moved_to_stopped_if_no_model_was_trained_on_it(
     interrupted: InterruptedRun, tmp_path: Path
 ) -> None:
@@ -347,12 +370,16 @@ def test_real_car_drives_no_further_episode_after_a_safety_stop(
     choice = choose_car("sim", seed=0)
     monkeypatch.setattr(choice.car, "reality", reality)
     run = RunDirectory.create(tmp_path, "outside")
-    for model in ("0001", "0002"):
-        shutil.copytree(interrupted.run.models / model, run.models / model)
+    for model in ("0001", "0002")[:n_episodes]:
+        without_check = shutil.ignore_patterns("diagnosis.json")
+        shutil.copytree(interrupted.run.models / model, run.models / model, ignore=without_check)
     with choice.car as car:
         car.place(CarState(5.0, 5.0))
         results = list(Campaign(choice, interrupted.plan, 2, run, place=False, record_rerun=False).run_episodes())
     assert [r.reason.name for r in results] == ["GEOFENCE"] * n_episodes
+    is_repeated = reality is Reality.REAL
+    assert [p.name for p in run.stopped.glob("*.mcap")] == ["0001.mcap"] * is_repeated, "no tick was driven"
+    assert not (run.models / "0001" / "diagnosis.json").exists()
 
 
 def test_report_is_written_for_an_episode_without_a_tick(interrupted: InterruptedRun, tmp_path: Path) -> None:

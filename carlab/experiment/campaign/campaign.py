@@ -41,7 +41,7 @@ from carlab.experiment.campaign.training import Progress, model_folder, training
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
 from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
-from carlab.recording.mcap.source import read_documents
+from carlab.recording.mcap.source import has_ticks, read_documents
 from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
@@ -54,7 +54,7 @@ CONTINUE_REASONS = frozenset(
 """End reasons after which the run continues; an untrained policy may leave the arena."""
 PAPER_HISTORY = 3
 STOPPED = frozenset({EndReason.STOP_REQUESTED, EndReason.LOOP_HUNG})
-"""End reasons after which the same episode is driven again."""
+"""End reasons after which the same episode is driven again, as after an end before the first tick."""
 PRIOR_HALF_WIDTH = 0.3
 """Relative half-width of the prior range of a parameter without a range in the car file."""
 DRY_RUN = "--dry-run"
@@ -191,22 +191,29 @@ class Campaign:
             self._check()
             yield result
             if not continues:
+                self.move_stopped_episode()
                 return
 
     def move_stopped_episode(self) -> None:
-        """Move the last recording to ``stopped`` if a person ended it or the loop hung; the episode is repeated."""
+        """Move the last recording to ``stopped``; the episode is repeated.
+
+        It is moved if a person ended it, the loop hung, or it has no complete tick, and no model was trained on it.
+        """
         recordings = self.run.recordings()
         if not recordings or model_folder(self.run.models, len(recordings) + 1).is_dir():
             return
         ends = [d.reason for d in read_documents(recordings[-1]) if isinstance(d, EpisodeEnded)]
-        if STOPPED & set(ends):
+        if STOPPED & set(ends) or not has_ticks(recordings[-1]):
             self.run.move_to_stopped(recordings[-1])
 
     def _check(self) -> None:
-        """Run the quick check of the newest recording, unless its result exists."""
-        number = len(self.run.recordings())
+        """Run the quick check of the newest recording, unless its result exists or the recording has no tick."""
+        recordings = self.run.recordings()
+        number = len(recordings)
         path = check_path(self.run, number)
-        if not number or not path.parent.is_dir() or path.is_file() or self.hooks.stop():
+        if not number or not path.parent.is_dir() or path.is_file() or not has_ticks(recordings[-1]):
+            return
+        if self.hooks.stop():
             return
         self.hooks.on_checking()
         simulator = self.checked_simulator or self.choice.simulator
