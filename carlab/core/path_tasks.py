@@ -28,6 +28,9 @@ def figure_eight_path(radius_m: float, points: int = 128) -> Corners:
     return tuple((float(a), float(b)) for a, b in zip(x, y, strict=True))
 
 
+START_LINE_M = 0.1
+"""Largest distance beyond the start line of a car that starts at it; the first lap of another car begins later, when it
+passes the line."""
 DEFAULT_PATH_M = figure_eight_path(1.2)
 DEFAULT_TRACK = oval_track()
 
@@ -124,7 +127,7 @@ class _ClosedPathTask(Task):
 
 
 def lap_times(times_s: FloatArray, travelled_m: FloatArray, length_m: float) -> list[float]:
-    """Durations of complete laps [s]; the first starts when the car first passes the start line, or at rest beyond it.
+    """Durations of complete laps [s]; the first starts when the car first passes the start line, or starts at it.
 
     Args:
         times_s: times (T,).
@@ -136,11 +139,11 @@ def lap_times(times_s: FloatArray, travelled_m: FloatArray, length_m: float) -> 
         after = int(np.argmax(travelled_m >= lap * length_m))
         if travelled_m[after] < lap * length_m:
             break
-        if after == 0:
-            crossings_s.append(float(times_s[0]))
-        else:
+        if after > 0:
             d, t = travelled_m[after - 1 : after + 1], times_s[after - 1 : after + 1]
             crossings_s.append(float(t[0] + (lap * length_m - d[0]) / (d[1] - d[0]) * (t[1] - t[0])))
+        elif travelled_m[0] <= START_LINE_M:
+            crossings_s.append(float(times_s[0]))
     return [float(d) for d in np.diff(crossings_s)]
 
 

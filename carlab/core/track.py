@@ -169,19 +169,20 @@ def read_track(path: Path | str) -> Track:
     """Read a track from a CSV file with the columns x, y and width [m] and a header. Raises ConfigError."""
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            lines = [line for line in csv.reader(file) if line and not line[0].lstrip().startswith("#")]
+            reader = csv.reader(file)
+            lines = [(reader.line_num, row) for row in reader if row and not row[0].lstrip().startswith("#")]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"The track {path} cannot be read ({reason}); name a CSV file with x, y, width.") from error
-    header = [cell.strip().lower().removesuffix("_m") for cell in lines[0]] if lines else []
+    header = [cell.strip().lower().removesuffix("_m") for cell in lines[0][1]] if lines else []
     if missing := [name for name in COLUMNS if name not in header]:
         raise ConfigError(f"The track {path} lacks the column {missing[0]}; its first line must be x,y,width [m].")
     rows = []
-    for index, line in enumerate(lines[1:], start=2):
+    for line_number, row in lines[1:]:
         try:
-            rows.append([float(line[header.index(name)]) for name in COLUMNS])
+            rows.append([float(row[header.index(name)]) for name in COLUMNS])
         except (ValueError, IndexError) as error:
-            raise ConfigError(f"Row {index} of the track {path} must have numbers for x, y and width.") from error
+            raise ConfigError(f"Row {line_number} of the track {path} must have numbers for x, y and width.") from error
     return _checked(rows, f"the track {path}")
 
 
@@ -197,6 +198,11 @@ def _checked(rows: list[list[float]], where: str) -> Track:
     steps = np.hypot(*(np.roll(values[:, :2], -1, axis=0) - values[:, :2]).T)
     if steps.min() < 1e-6:
         raise ConfigError(f"{where} has two equal points in a row; remove one.")
+    before, after = np.roll(values[:, :2], 1, axis=0), np.roll(values[:, :2], -1, axis=0)
+    turns_back = np.hypot(*(after - before).T) < 1e-6
+    if turns_back.any():
+        x, y = values[turns_back.argmax(), :2]
+        raise ConfigError(f"{where} turns back on itself at ({x:g}, {y:g}) m; give the centre line of a closed track.")
     if values[:, 2].min() < MIN_WIDTH_M or values[:, 2].max() > steps.sum() or steps.sum() > MAX_LENGTH_M:
         raise ConfigError(
             f"{where} is {steps.sum():.4g} m long and {values[:, 2].min():.3g} to {values[:, 2].max():.3g} m wide, "

@@ -85,6 +85,17 @@ def test_incomplete_lap_or_a_left_track_is_no_success(end: float, radius_m: floa
     assert math.isnan(summary["best_lap_s"]) == (end < 1.0)
 
 
+def test_first_lap_of_a_car_that_starts_beyond_the_line_begins_at_the_line() -> None:
+    """Laps of 2.5 s; the drive starts 1 rad beyond the line."""
+    times_s = np.arange(0, 5.0, 1 / 30)
+    states = circle_states(1.0 + 2 * math.pi / 2.5 * times_s, 2.0)
+    task, after_first_passage = LapTask(track=circle_track()), times_s > 2.2
+    once = task.summary(times_s[~after_first_passage], states[~after_first_passage])
+    assert (math.isnan(once["best_lap_s"]), once["success"]) == (True, 0.0)
+    twice = task.summary(times_s, states)
+    assert (twice["best_lap_s"], twice["success"]) == (pytest.approx(2.5, abs=2e-3), 1.0)
+
+
 def test_backward_laps_do_not_count() -> None:
     angles = np.linspace(0, -4 * math.pi, 200)
     summary = LapTask(track=circle_track()).summary(np.linspace(0, 5, 200), circle_states(angles, 2.0))
@@ -131,6 +142,8 @@ def test_track_of_a_csv_file_and_of_a_table_are_equal(tmp_path: Path) -> None:
         ("", "lacks the column x"),
         ("x,y\n0,0\n", "lacks the column width"),
         ("x,y,width\n0,0,a\n", "Row 2"),
+        ("# oval\n\nx,y,width\n0,0,1\n\n1,0,a\n", "Row 6"),
+        ("x,y,width\n0,0,1\n1,0,1\n2,0,1\n1,0,1\n", r"turns back on itself at \(0, 0\) m"),
         ("x,y,width\n0,0,1\n1,0,1\n", "2 points"),
         ("x,y,width\n0,0,1\n1,0,1\n1,0,1\n0,1,1\n", "two equal points"),
         ("x,y,width\n0,0,nan\n1,0,1\n0,1,1\n", "not finite"),
