@@ -28,6 +28,19 @@ def test_first_signal_requests_a_stop_and_second_one_is_urgent(number: signal.Si
     assert signal.getsignal(number) is before
 
 
+def test_hangup_that_nohup_ignores_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Interrupts() as outer, Interrupts() as inner:
+            signal.raise_signal(signal.SIGHUP)
+            assert inner.reason() is None
+            signal.raise_signal(signal.SIGTERM)
+        assert outer.reason() is EndReason.STOP_REQUESTED
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_signal_in_an_inner_context_is_passed_to_the_outer_one() -> None:
     with Interrupts() as outer:
         with Interrupts():

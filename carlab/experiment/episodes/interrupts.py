@@ -60,6 +60,8 @@ def check_main_thread() -> None:
 class Interrupts:
     """Context in which signals become stop requests; an inner context keeps an earlier request.
 
+    SIGHUP stays ignored if it is ignored at the start: nohup ignores it so that a run outlives its terminal.
+
     Raises:
         ConfigError: it is entered outside the main thread.
     """
@@ -74,6 +76,8 @@ class Interrupts:
     def __enter__(self) -> Self:
         check_main_thread()
         for number in SIGNALS:
+            if number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue
             self._previous[number] = signal.signal(number, self._handle)
             outer = getattr(self._previous[number], "__self__", None)
             if isinstance(outer, Interrupts) and outer.requested.is_set():
