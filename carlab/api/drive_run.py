@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.api.runs import html_picture, html_table
+from carlab.api.runs import figure_names, html_picture, html_table
 from carlab.core.errors import add_sentence
 
 if TYPE_CHECKING:
@@ -55,9 +56,15 @@ class DriveRun:
         return f"<DriveRun {self.folder}: {len(self.episodes)} episodes, {end}>"
 
     def _repr_html_(self) -> str:
-        names = list(self.episodes[0].summary) if self.episodes else []
+        names = figure_names(self.episodes)
         rows = [
-            [e.episode, e.data.ticks, e.total_reward, *(float(e.summary[n]) for n in names), e.reason.name.lower()]
+            [
+                e.episode,
+                e.data.ticks,
+                e.total_reward,
+                *(e.summary.get(n, math.nan) for n in names),
+                e.reason.name.lower(),
+            ]
             for e in self.episodes
         ]
         return html_table(["episode", "ticks", "return", *names, "end"], rows) + html_picture(self.picture)

@@ -269,6 +269,11 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
     run.write_result({"end_reason": results[-1].reason.name, "episodes": episodes})
 
 
+def figure_names(results: Sequence[EpisodeResult]) -> list[str]:
+    """Names of the figures in the summaries of episodes; an episode may lack some of them."""
+    return list(dict.fromkeys(name for result in results for name in result.summary))
+
+
 def html_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A table for a notebook; numbers with four digits."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
+from carlab.api.runs import figure_names
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import CarOptions, TaskOptions
@@ -141,13 +143,13 @@ class Drive:
         if not results:
             console.print("No episode was driven.")
             return EXIT_INTERRUPTED
-        names = list(results[0].summary)
+        names = figure_names(results)
         rows = [
             [
                 str(r.episode),
                 str(r.data.ticks),
                 f"{r.total_reward:.1f}",
-                *(figure_text(name, r.summary[name]) for name in names),
+                *(figure_text(name, r.summary.get(name, math.nan)) for name in names),
                 r.reason.name.lower().replace("_", " "),
             ]
             for r in results

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import shlex
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
+from carlab.api.runs import figure_names
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import CarOptions, TaskOptions
@@ -261,13 +263,13 @@ class Learn:
 
     def _print_episodes(self, run: LearnRun) -> None:
         """Table of the episodes, and the number of successes."""
-        names = list(dict.fromkeys(name for r in run.results for name in r.summary if name != "success"))
+        names = [name for name in figure_names(run.results) if name != "success"]
         table(
             "",
             ["episode", "return", "predicted", *(heading(n) for n in names), "success", "end"],
             [
                 [str(row.episode), f"{row.total_reward:.1f}", f"{row.predicted_return:.1f}",
-                 *(figure_text(n, result.summary[n]) for n in names), "yes" if row.success else "no",
+                 *(figure_text(n, result.summary.get(n, math.nan)) for n in names), "yes" if row.success else "no",
                  row.end.lower().replace("_", " ")]
                 for row, result in zip(run.episodes, run.results, strict=True)
             ],

@@ -42,6 +42,11 @@ class Timed(Forward):
     def max_ticks(self):
         return 30
 
+class Sometimes(Forward):
+    def summary(self, times_s, states):
+        figures = {"success": 0.0}
+        return figures | ({"left_m": states[0, 1]} if states[0, 1] > 0.0 else {"right_m": -states[0, 1]})
+
 class Broken(Forward):
     def reward(self, features, action, next_features):
         return next_features[..., 0:1]
@@ -202,6 +207,17 @@ def test_policy_folder_that_is_no_run_is_refused(
     assert code == 1
     assert "has no policy" in text
     assert not (tmp_path / "runs").exists()
+
+
+def test_figures_that_only_some_episodes_have_are_printed(carlab: Carlab, file: Path, tmp_path: Path) -> None:
+    options = ("--policy", "neutral", "--episodes", 4, "--ticks", 3, "--no-rerun", "--no-picture")
+    code, text = carlab("drive", "--task", f"{file}:Sometimes", *options, "--out", tmp_path)
+    assert code == 0
+    assert {"left", "right"} <= set(text.split())
+    (folder,) = tmp_path.iterdir()
+    rows = json.loads((folder / "result.json").read_text())["episodes"]
+    assert {name for row in rows for name in row} >= {"left_m", "right_m"}, "both kinds of episodes were driven"
+    assert all(("left_m" in row) != ("right_m" in row) for row in rows)
 
 
 def test_parking_policy_is_refused_for_laps(carlab: Carlab, tmp_path: Path) -> None:
