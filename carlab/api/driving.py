@@ -267,7 +267,7 @@ def _policy_and_task(
     given = given_task(task, track, choice.track)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names():
         return _learned(Path(policy), given, choice)
-    chosen = load_checked(given or PARKING, choice.envelope.arena_m)
+    chosen = _task_to_drive(given or PARKING, choice)
     if policy == "parking" and not isinstance(chosen, ParkingTask):
         raise ConfigError(f"The parking policy only parks; choose another --policy for --task {chosen.name}.")
     policy = str(policy) if isinstance(policy, Path) else policy
@@ -288,8 +288,17 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
             f"{choice.control_period_s:.4g} s; choose a car with the same control_period."
         )
     chosen = own.named_again(given) if given is None or given.name == own.name else given
-    task = load_checked(chosen, choice.envelope.arena_m)
+    task = _task_to_drive(chosen, choice)
     return learned.policy, task.resized(learned.history, learned.plan.ticks)
+
+
+def _task_to_drive(chosen: TaskChoice, choice: CarChoice) -> Task:
+    """The task, checked; not carlab's parking and a recorded task, because such a drive may start at another place."""
+    from carlab.core.task import ParkingTask, RecordedTask
+
+    task = chosen.load()
+    is_unchecked = isinstance(task, RecordedTask) or (isinstance(task, ParkingTask) and not chosen.sha256)
+    return task if is_unchecked else load_checked(chosen, choice.envelope.arena_m)
 
 
 def _without_arena(policy: str | Policy, task: Task, choice: CarChoice) -> Task:

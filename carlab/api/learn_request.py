@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from carlab.api.cars import car_options_text
-from carlab.api.tasks import given_task, load_checked
+from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
 from carlab.experiment.cluster.settings import LinkSettings
 
@@ -74,6 +74,8 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
         history = PAPER_HISTORY if request.method in PAPER_METHODS else needed_history(choice.simulator)
     task_choice = given_task(request.task, request.track, choice.track) or PARKING
     task = load_checked(task_choice, choice.envelope.arena_m)
+    check_trainable(task_choice)
+    _check_extent(task)
     if (ticks := request.ticks or task.max_ticks) <= history:
         raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
     task.resized(history, request.ticks)
@@ -82,6 +84,22 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
         text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
         device=request.device or "cpu", task_choice=task_choice,
     )  # fmt: skip
+
+
+def _check_extent(task: Task) -> None:
+    """Raise ConfigError if start, goal or path lie beyond the positions that a policy observes."""
+    import numpy as np
+
+    from learning.world.model_env import FEATURE_UNITS, MAX_POLICY_INPUT
+
+    limit_m = MAX_POLICY_INPUT * FEATURE_UNITS[0]
+    start = task.sample_start(np.random.default_rng(0))
+    points = [(start.x_m, start.y_m), *task.path_m, *([task.goal[:2]] if task.goal else [])]
+    if (farthest_m := max(abs(value) for point in points for value in point)) > limit_m:
+        raise ConfigError(
+            f"The task {task.name} has a coordinate of {farthest_m:.4g} m; a learned policy observes positions up to "
+            f"{limit_m:g} m, so move the origin of motion capture into the arena."
+        )
 
 
 def _prior(request: LearnRequest, choice: CarChoice) -> SimulatorConfig:

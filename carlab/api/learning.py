@@ -25,7 +25,7 @@ from carlab.api.runs import (
     viewer_connection,
     write_result,
 )
-from carlab.api.tasks import given_task, load_checked
+from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
 from carlab.core.method_names import current_method
 
@@ -347,6 +347,7 @@ def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack:
     task_choice = campaign.plan.task_choice.named_again(given_task(request.task, request.track, choice.track))
     campaign.plan = replace(campaign.plan, task_choice=task_choice)
     load_checked(task_choice, choice.envelope.arena_m)
+    check_trainable(task_choice)
     if not request.ray:
         available(campaign.plan.device)
     _check_as_before(request, campaign, choice)

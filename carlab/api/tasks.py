@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.core.keep_out import Corners
@@ -32,17 +36,33 @@ def given_task(task: str | Task | None, track: Path | str | None, car_track: Tra
     return choose_task(task or "laps", given or (car_track if task == "laps" else None))
 
 
+def check_trainable(choice: TaskChoice) -> None:
+    """Raise ConfigError if the process that trains cannot import the class of a task object."""
+    if choice.given is None:
+        return
+    main_file = getattr(sys.modules["__main__"], "__file__", None)
+    try:
+        pickle.dumps(choice.given)
+        reason = "it is defined in a notebook or at a prompt"
+        is_importable = choice.given.__module__ != "__main__" or (main_file is not None and Path(main_file).is_file())
+    except Exception as error:
+        reason, is_importable = str(error), False
+    if not is_importable:
+        raise ConfigError(
+            f"The process that trains cannot import the task {choice.name} ({reason}); define its class at the top "
+            "level of a file, and import it or name it as FILE.py:CLASS."
+        )
+
+
 def load_checked(choice: TaskChoice, arena_m: Corners) -> Task:
-    """Make the task; check it if it is a user's or has a path. Raises ConfigError with the error of the task.
+    """Make the task and check it. Raises ConfigError with the error of the task.
 
     Args:
         choice: the task.
         arena_m: arena of the car; empty without one.
     """
-    from carlab.core.task import RecordedTask
     from carlab.experiment.episodes.task_check import check_task
 
     task = choice.load()
-    if not isinstance(task, RecordedTask) and (choice.sha256 or task.path_m):
-        check_task(task, arena_m)
+    check_task(task, arena_m)
     return task

@@ -27,6 +27,8 @@ from carlab.core.quantities import CarState, FloatArray
 PAPER_ARENA_M: Corners = rectangle(-1.4, 2.8, -2.6, 1.5)
 START_MARGIN_M = 0.4
 """Smallest distance of a random start from the edge of the arena."""
+MAX_START_DRAWS = 1000
+"""Number of random starts in keep-out shapes after which the shapes count as covering the arena."""
 
 
 class Task(ABC):
@@ -241,12 +243,17 @@ class ObstacleParkingTask(ParkingTask):
         return self.obstacles
 
     def sample_training_start(self, rng: np.random.Generator) -> CarState:
-        """Draw a state at rest anywhere in the arena outside the discs, with any yaw, as in the authors' simulation."""
+        """Draw a state at rest anywhere in the arena outside the discs, with any yaw, as in the authors' simulation.
+
+        Raises:
+            ConfigError: the discs cover the arena.
+        """
         low, high = np.min(self.arena_m, axis=0), np.max(self.arena_m, axis=0)
-        while True:
+        for _ in range(MAX_START_DRAWS):
             x, y = rng.uniform(low + START_MARGIN_M, high - START_MARGIN_M)
             if not any(bool(shape.contains(np.array([x, y]))) for shape in self.keep_out):
                 return CarState(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
+        raise ConfigError("the keep-out shapes cover the arena; make them smaller")
 
     def cost(self, next_features: Any) -> Any:
         """Kinetic energy [J] inside a disc, zero outside."""

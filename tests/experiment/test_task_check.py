@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from carlab.api.tasks import load_checked
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import rectangle
 from carlab.core.keep_out import Disc
 from carlab.core.quantities import CarState
-from carlab.core.task import Task
+from carlab.core.task import ObstacleParkingTask, Task
 from carlab.core.task_choice import TASKS, choose_task
 from carlab.experiment.episodes.task_check import check_task
 
@@ -77,6 +78,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"goal": (1.0, 0.0)}, "goal is"),
     ({"goal": (2.0, 0.0, 0.0)}, "success is false for a car at rest at the goal"),
     ({"keep_out": (Disc(0.0, 0.0, 0.3),)}, "cost is above zero at a start"),
+    ({"keep_out": (Disc(1.0, 0.0, 0.3),)}, r"the goal \(1, 0\) is in a keep-out shape"),
     ({"keep_out": ((0.0, 0.0, 0.3),)}, "keep_out must be a tuple of Disc and Polygon"),
     ({"sample_start": start(x_m=150.0)}, "outside the arena"),
     ({"sample_start": start(yaw_rad=180.0)}, "yaw of 180; angles are in radians"),
@@ -131,6 +133,17 @@ def test_each_error_is_named_in_one_sentence(members: dict[str, Any], message: s
 def test_path_outside_the_arena_of_the_car_is_refused() -> None:
     with pytest.raises(ConfigError, match="its path leaves the arena"):
         check_task(TASKS["laps"](), rectangle(-1.0, 1.0, -2.0, 2.0))
+
+
+def test_obstacles_that_cover_the_arena_are_refused() -> None:
+    with pytest.raises(ConfigError, match="the keep-out shapes cover the arena"):
+        check_task(ObstacleParkingTask(obstacles=(Disc(0.0, 0.0, 10.0),)))
+
+
+@pytest.mark.parametrize("name", ["parking", "obstacles"])
+def test_parking_is_refused_in_an_arena_without_its_start(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"the start \(.*\) is outside the arena"):
+        load_checked(choose_task(name), rectangle(-1.0, 1.0, -1.0, 1.0))
 
 
 def test_numbers_of_numpy_in_a_summary_and_tensors_with_gradient_are_accepted() -> None:

@@ -164,6 +164,8 @@ def _check_goal(task: Task, arena_m: Corners) -> None:
         raise _error(task, f"the goal has a yaw of {values[2]:.4g}; angles are in radians")
     if arena_m and not contains(arena_m, float(values[0]), float(values[1])):
         raise _error(task, f"the goal ({values[0]:.4g}, {values[1]:.4g}) is outside the arena; {_METRES}")
+    if any(bool(shape.contains(values[:2])) for shape in task.keep_out):
+        raise _error(task, f"the goal ({values[0]:.4g}, {values[1]:.4g}) is in a keep-out shape; move one of them")
     if type(task).success is not Task.success:
         at_goal = encode(np.array([*values, 0.0, 0.0, 0.0]), np.zeros((task.history_length, ACTION_SIZE)))
         if not bool(np.all(_call(task, "success", task.success, at_goal))):
