@@ -38,8 +38,8 @@ def _training_messages(figures: dict[str, Any]) -> list[str]:
     messages = [figures["history_message"]] if "history_message" in figures else []
     if (ticks := figures.get("needed_ticks")) is not None:
         messages.append(
-            f"In the learned car the policy parks only in longer episodes: in half of them within {ticks} ticks. Start "
-            f"a run with --ticks {ticks} to give it this time."
+            f"In the learned car the policy succeeds only in longer episodes: in half of them within {ticks} ticks. "
+            f"Start a run with --ticks {ticks} to give it this time."
         )
     return messages
 
@@ -100,8 +100,8 @@ class Learn:
     third it is multiplied by 3 / episode."""
 
     seed: int = 0
-    """Seed of all random numbers. The same seed gives the same run; with --prior auto only up to the first diagnosis,
-    because a diagnosis has a time limit."""
+    """Seed of all random numbers. The same seed gives the same run. Exceptions: a resumed run, because the noise of the
+    simulated sensors begins again; with --prior auto a run after its first diagnosis, which has a time limit."""
 
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from carlab.cli import run
+from carlab.cli.learn import _training_messages
 from carlab.core.observation import episode_features
 from carlab.core.task import ObstacleParkingTask
 from carlab.core.track import oval_track
@@ -218,6 +219,12 @@ def test_figures_that_only_some_episodes_have_are_printed(carlab: Carlab, file: 
     rows = json.loads((folder / "result.json").read_text())["episodes"]
     assert {name for row in rows for name in row} >= {"left_m", "right_m"}, "both kinds of episodes were driven"
     assert all(("left_m" in row) != ("right_m" in row) for row in rows)
+
+
+def test_message_about_longer_episodes_names_no_task() -> None:
+    (message,) = _training_messages({"needed_ticks": 150})
+    assert "Start a run with --ticks 150" in message
+    assert "park" not in message
 
 
 def test_parking_policy_is_refused_for_laps(carlab: Carlab, tmp_path: Path) -> None:

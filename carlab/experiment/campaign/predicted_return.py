@@ -1,4 +1,4 @@
-"""Predicted return of the next episode with a 90 % interval, and the time that the car needs to park.
+"""Predicted return of the next episode with a 90 % interval, and the time that the car needs for success.
 
 The prediction mixes two kinds of cars: the learned car, and simulated cars drawn from the prior with plausible unknown
 effects, of which those that fit the recordings best are used. Before the first recording both have equal weights. The
@@ -88,7 +88,7 @@ def _own_features(seen: NDArray[np.float32], history: int) -> NDArray[np.float32
 
 
 def _sufficient_ticks(plan: TrainingPlan, agent: SacAgent, learned: ModelEnv) -> dict[str, Any]:
-    """``needed_ticks`` if the policy parks the learned car only in longer drives than an episode; empty otherwise."""
+    """``needed_ticks`` if the policy succeeds in the learned car only in longer drives; empty otherwise."""
     ticks = plan.task.max_ticks
     for factor in (1.0, *LONGER_EPISODE_FACTORS):
         length = round(factor * ticks)
