@@ -44,10 +44,10 @@ def load_policy(folder: Path) -> LearnedPolicy:
     Raises:
         DataError: the folder has no policy, or it cannot be read.
     """
-    is_model = folder.parent.name == "models" and folder.name.isdigit()
+    is_model = folder.parent.name == "models" and folder.name.isdecimal()
     run = folder.parent.parent if is_model else folder
     plan = saved_plan(run)
-    folders = [folder] if is_model else sorted(p for p in run.glob("models/*") if p.name.isdigit())
+    folders = [folder] if is_model else sorted(p for p in run.glob("models/*") if p.name.isdecimal())
     folders = [p for p in folders if (p / AGENT_FILE).is_file()]
     if not folders:
         raise DataError(f"{folder} has no policy; name the folder of a run of carlab learn with a finished training.")
