@@ -24,6 +24,7 @@ Carlab = Callable[..., tuple[int, str]]
 TICKS = 20
 TINY = ("--ticks", TICKS, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun", "--episodes", 1)
 SOURCE = """
+import numpy as np
 import carlab
 from carlab.core.keep_out import Disc
 from carlab.core.task import Task
@@ -47,6 +48,12 @@ class Sometimes(Forward):
     def summary(self, times_s, states):
         figures = {"success": 0.0}
         return figures | ({"left_m": states[0, 1]} if states[0, 1] > 0.0 else {"right_m": -states[0, 1]})
+
+class NumPy(Forward):
+    arena_m = tuple(map(tuple, np.array([[-4, -4], [4, -4], [4, 4], [-4, 4]])))
+    goal = tuple(np.array([1.0, 0.0, 0.0], dtype=np.float32))
+    path_m = tuple(map(tuple, np.array([[0, 0], [1, 0], [1, 1]])))
+    outlines_m = (path_m,)
 
 class Broken(Forward):
     def reward(self, features, action, next_features):
@@ -219,6 +226,16 @@ def test_figures_that_only_some_episodes_have_are_printed(carlab: Carlab, file: 
     rows = json.loads((folder / "result.json").read_text())["episodes"]
     assert {name for row in rows for name in row} >= {"left_m", "right_m"}, "both kinds of episodes were driven"
     assert all(("left_m" in row) != ("right_m" in row) for row in rows)
+
+
+def test_numbers_of_numpy_in_a_task_are_recorded(carlab: Carlab, file: Path, tmp_path: Path) -> None:
+    code, text = carlab("drive", "--task", f"{file}:NumPy", "--policy", "neutral", "--ticks", 3, "--out", tmp_path)
+    assert code == 0, text
+    (folder,) = tmp_path.iterdir()
+    metadata = read_episode(folder / "episodes" / "0001.mcap").metadata
+    assert json.loads(metadata["arena_m"]) == [[-4.0, -4.0], [4.0, -4.0], [4.0, 4.0], [-4.0, 4.0]]
+    assert json.loads(metadata["goal"]) == [1.0, 0.0, 0.0]
+    assert json.loads(metadata["outlines_m"]) == [json.loads(metadata["path_m"])] == [[[0, 0], [1, 0], [1, 1]]]
 
 
 def test_message_about_longer_episodes_names_no_task() -> None:

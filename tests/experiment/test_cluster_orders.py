@@ -30,7 +30,8 @@ from carlab.recording.run_folder import RunDirectory
 
 
 def test_order_is_read_as_it_was_sent(run: RunDirectory, tmp_path: Path) -> None:
-    envelope = SafetyEnvelope(max_throttle=0.3, arena_m=((0.0, 0.0), (1.0, 0.5), (0.0, 2.0)))
+    numpy_corner = (np.int64(1), np.float32(0.5))  # of a user's task
+    envelope = SafetyEnvelope(max_throttle=0.3, arena_m=((0.0, 0.0), numpy_corner, (0.0, 2.0)))
     sent = TrainingOrder(small_plan(seed=4), run.models, tuple(run.recordings()), envelope)
     files = sent.files()
     assert set(files) == {"order.json", "episodes/0001.mcap", "models/0001/dynamics.npz", "models/0001/policy.npz"}

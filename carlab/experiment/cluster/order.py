@@ -78,7 +78,7 @@ class TrainingOrder:
             "envelope": asdict(self.envelope),
             "recordings": [path.name for path in self.recordings],
         }
-        files = {ORDER_FILE: json.dumps(content).encode()}
+        files = {ORDER_FILE: json.dumps(content, default=float).encode()}  # NumPy numbers of a task's arena
         files |= {f"{EPISODES}/{path.name}": path.read_bytes() for path in self.recordings}
         earlier = model_folder(self.models, self.number - 1)
         if earlier.is_dir():

@@ -23,6 +23,7 @@ from carlab.core.clock import Pacer, TickTiming, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, HealthReading, Tick, Transition
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ActuatorFaultError, CarlabError, NotReadyError, PoseLostError
+from carlab.core.keep_out import Corners
 from carlab.core.observation import ActionHistory, encode
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy, PolicyInput
@@ -171,7 +172,7 @@ def run_episode(
     hooks.emit(EpisodeStarted(
         episode=episode, t_s=car.clock.now_s(), wall_ns=wall_clock_ns(), car=car.name, reality=car.reality,
         policy=policy.name, task=task.name, seed=seed, period_s=period_s, history_length=task.history_length,
-        goal=task.goal, arena_m=envelope.arena_m, path_m=task.path_m, config_toml=config_toml,
+        goal=_goal_of(task), arena_m=_floats(envelope.arena_m), path_m=_floats(task.path_m), config_toml=config_toml,
         metadata={**(metadata or {}), **_outlines_text(task)},
     ))  # fmt: skip
     reason, detail = EndReason.CRASHED, ""
@@ -193,8 +194,20 @@ def run_episode(
     return rows.finish({**origin, "seed": str(seed), **(metadata or {}), **_end_texts(reason, detail)})
 
 
+def _floats(points_m: Corners) -> Corners:
+    """Points as Python numbers: those of a user's task may be NumPy's, which JSON does not have."""
+    return tuple((float(x), float(y)) for x, y in points_m)
+
+
+def _goal_of(task: Task) -> tuple[float, float, float] | None:
+    if task.goal is None:
+        return None
+    x, y, yaw = task.goal
+    return float(x), float(y), float(yaw)
+
+
 def _outlines_text(task: Task) -> dict[str, str]:
-    return {"outlines_m": json.dumps(task.outlines_m)} if task.outlines_m else {}
+    return {"outlines_m": json.dumps([_floats(line) for line in task.outlines_m])} if task.outlines_m else {}
 
 
 def _end_texts(reason: EndReason, detail: str) -> dict[str, str]:
