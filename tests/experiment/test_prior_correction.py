@@ -163,6 +163,7 @@ def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
         *("{", "[]", '{"corrections": [1], "history": 4, ' + rest),
         *('{"corrections": [], "history": ' + history + ", " + rest for history in ("-1", "1e9", "NaN", "1e999")),
         '{"corrections": [], "history": 4, "sentence": "", "diagnosed": 1e999}',
+        json.dumps(PriorVersion((replace(MOTOR_LAG, values={"effects.renamed.gain": 1.0}),)).to_dict()),
     ):
         path.write_text(content)
         with pytest.raises(DataError, match=r"remove it, and the run repeats the correction\.$"):

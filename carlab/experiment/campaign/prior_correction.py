@@ -95,6 +95,8 @@ class PriorVersion:
             )
             for c in content["corrections"]
         )  # fmt: skip
+        if unknown := {name for c in corrections for name in (*c.values, *c.std)} - REGISTRY.keys():
+            raise ValueError(f"unknown number {min(unknown)!r}")
         history = int(content["history"])
         if not 0 <= history <= LARGEST_GIVEN_HISTORY:
             raise ValueError(f"history is {history}")
