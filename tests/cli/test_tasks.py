@@ -55,6 +55,17 @@ class NumPy(Forward):
     path_m = tuple(map(tuple, np.array([[0, 0], [1, 0], [1, 1]])))
     outlines_m = (path_m,)
 
+class Rare(Forward):
+    starts = 0
+    def sample_start(self, rng):
+        type(self).starts += 1
+        if self.starts > 41:  # 40 starts of the check, one of the first episode
+            raise ZeroDivisionError("no start")
+        return super().sample_start(rng)
+
+    def sample_training_start(self, rng):
+        return super().sample_start(rng)
+
 class Broken(Forward):
     def reward(self, features, action, next_features):
         return next_features[..., 0:1]
@@ -226,6 +237,14 @@ def test_figures_that_only_some_episodes_have_are_printed(carlab: Carlab, file: 
     rows = json.loads((folder / "result.json").read_text())["episodes"]
     assert {name for row in rows for name in row} >= {"left_m", "right_m"}, "both kinds of episodes were driven"
     assert all(("left_m" in row) != ("right_m" in row) for row in rows)
+
+
+def test_error_of_a_start_ends_the_run_with_one_sentence(carlab: Carlab, file: Path, tmp_path: Path) -> None:
+    options = ("--policy", "neutral", "--episodes", 3, "--ticks", 3, "--no-rerun", "--no-picture")
+    code, text = carlab("drive", "--task", f"{file}:Rare", *options, "--out", tmp_path)
+    assert code == 2
+    assert "The task forward cannot draw a start (ZeroDivisionError: no start); correct its sample_start." in text
+    assert "has the episode before, see result.json" in text
 
 
 def test_numbers_of_numpy_in_a_task_are_recorded(carlab: Carlab, file: Path, tmp_path: Path) -> None:

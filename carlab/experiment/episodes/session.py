@@ -124,7 +124,8 @@ class Session:
         """Drive episodes; ends early on a stop request or after a safety stop.
 
         Raises:
-            SafetyStop: the loop hung and the watchdog thread stopped the car. Other errors: those of run_episode.
+            SafetyStop: the loop hung and the watchdog thread stopped the car. ConfigError: the task cannot draw a
+                start, or cannot evaluate an episode. Other errors: those of run_episode.
         """
         results: list[EpisodeResult] = []
         starts = np.random.SeedSequence(self.seed).spawn(episodes)
@@ -132,7 +133,7 @@ class Session:
             for index in range(episodes):
                 if self._abandoned is not None:
                     raise self._abandoned
-                start = self.task.sample_start(np.random.default_rng(starts[index]))
+                start = _start_of(self.task, np.random.default_rng(starts[index]))
                 if not (self.place and self.car.place(start)):
                     if self.place:
                         interrupts.prompt(functools.partial(self.hooks.place_by_hand, start))
@@ -239,6 +240,16 @@ class _Emitter:
         if isinstance(document, Tick):
             self.last_tick = document
             self._hooks.on_tick(document)
+
+
+def _start_of(task: Task, rng: np.random.Generator) -> CarState:
+    """A start of the task. Raises ConfigError if the task cannot draw one."""
+    try:
+        return task.sample_start(rng)
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"The task {task.name} cannot draw a start ({type(error).__name__}: {error}); correct its sample_start."
+        ) from error
 
 
 def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:
