@@ -244,5 +244,12 @@ def test_sets_and_spurious_names() -> None:
     assert (two["first_with_sets"], two["found"], two["spurious"]) == (False, 1, ["motor_lag"])
     none = score_comparison(truth, None, {})
     assert (none["first"], none["verdict"]) == (False, "no report")
+    untouched = {"kind": "null", "part": [], "effects": []}
+    rows = {"a": none, "b": score_comparison(untouched, None, {}), "c": score_comparison(untouched, report(), {})}
+    add_visibility(rows)
+    counts = {row[0]: row[2] for row in rate_rows(rows)}
+    assert counts["named first, sets allowed, all sizes"] == "0/1"
+    assert counts["cases with a spurious name"] == "0/0"
+    assert counts["false alarms, untouched recordings"] == "0/1"
     with pytest.raises(DataError, match="schema"):
         score_comparison(truth, {"schema": "other/1"}, {})

@@ -15,6 +15,7 @@ from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.seal import check, digest, new_nonce
 from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.case_score import score_case, valid_set
+from carlab.benchmark.proof.detection import spurious_curves
 from carlab.benchmark.proof.runner import Proof
 from carlab.benchmark.proof.scores import (
     confusion,
@@ -141,6 +142,17 @@ def test_missing_report_is_a_miss_and_wrong_schema_an_error() -> None:
     assert not row["reported"]
     with pytest.raises(DataError, match="schema"):
         score_case(answer(), report("steering_lag") | {"schema": "carlab.diagnosis/9"})
+
+
+def test_missing_report_is_no_evidence_against_false_alarms_and_no_correct_verdict() -> None:
+    wrong_model = {"conditions": ["base model kinematic"], "implied_effects": ["tyre_saturation"]}
+    rows = [score_case(answer(kind, **wrong_model), None) for kind in ("null", "parameters")]
+    rows += [score_case(answer("outside"), None), score_case(answer("null"), report("motor_lag"))]
+    counts = {r["figure"]: (r["hits"], r["count"]) for r in summarise(rows)["rates"]}
+    assert counts["false alarms, null and parameters"] == (1, 1)
+    assert counts["verdict correct, null and parameters"] == (0, 3)
+    assert counts["outside: spurious attribution"] == (0, 0)
+    assert spurious_curves(rows) == []
 
 
 def test_wilson_interval_equals_published_values() -> None:

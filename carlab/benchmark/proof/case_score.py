@@ -43,7 +43,7 @@ def score_case(
 
     Returns:
         A flat table; figures that do not apply to the kind of case are absent. Names that a wrong base model implies
-        do not count.
+        do not count. Without a report, ``false_alarm`` and ``is_spurious`` are None: the tool has not answered.
     """
     row: dict[str, Any] = {
         "kind": answer["kind"],
@@ -86,9 +86,10 @@ def _criteria_of_kind(
     elif kind == "outside":
         _outside(row, answer, report)
     else:
-        row["false_alarm"] = bool(named)
+        row["false_alarm"] = bool(named) if row["reported"] else None
         if any(name.startswith("base model") for name in row["conditions"]):
-            row["verdict_right"] = not named  # the car file lacks physics, so every verdict without a name is correct
+            # The car file lacks physics, so every verdict without a name is correct.
+            row["verdict_right"] = row["reported"] and not named
         elif kind == "parameters":
             row["verdict_right"] = row["verdict"] == "parameters"
         elif kind == "null":
@@ -170,7 +171,7 @@ def _parameters(found: Json, true: Json) -> dict[str, dict[str, Any]]:
 
 
 def _outside(row: dict[str, Any], answer: Json, report: Json | None) -> None:
-    row["is_spurious"] = bool(row["named"])
+    row["is_spurious"] = bool(row["named"]) if row["reported"] else None
     row["is_random"] = answer["effects"][0]["form"] == "random"
     unexplained = (report or {}).get("unexplained") or {}
     channels = list(unexplained.get("channels") or [])

@@ -53,10 +53,10 @@ def detection_curves(rows: Iterable[Row]) -> list[Curve]:
 
 
 def spurious_curves(rows: Iterable[Row]) -> list[Curve]:
-    """Return the share of cases outside the catalogue with a spurious name, for listed and for random physics."""
+    """Return the share of reports on uncatalogued physics with a spurious name, for listed and for random physics."""
     groups: dict[str, list[tuple[float, bool]]] = {}
     for row in rows:
-        if row["kind"] == "outside":
+        if row["kind"] == "outside" and row["reported"]:
             group = "random physics" if row["is_random"] else "listed physics"
             groups.setdefault(group, []).append((float(row["excess"]), bool(row["is_spurious"])))
     return [Curve.of(group, groups[group]) for group in sorted(groups)]

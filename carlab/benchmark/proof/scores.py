@@ -22,7 +22,7 @@ Row = Mapping[str, Any]
 
 
 def _strong(row: Row) -> bool:
-    """Return whether the excess is 1 or more; the search for a strength stops within 15 % of its target."""
+    """Return whether the excess is 1 or more; cases from 0.85 on count, because the search for a size ends near 1."""
     return float(row["excess"]) >= 0.85
 
 

@@ -35,7 +35,8 @@ def score_comparison(answer: Json, report: Json | None, model: Json, seconds: fl
 
     Returns:
         A flat table. ``first`` and ``first_with_sets``: the first name is correct (of a pair: one of both); ``found``:
-        concealed effects that are named or in a set; ``spurious``: names that are not concealed.
+        concealed effects that are named or in a set; ``spurious``: names that are not concealed. Rates of false alarms
+        and spurious names leave cases without a report out.
 
     Raises:
         DataError: the report has another schema.
@@ -175,6 +176,10 @@ def _visible(row: Json, min_stds: float = VISIBLE_STDS) -> bool:
     return _single(row) and row["stds"] is not None and row["stds"] >= min_stds
 
 
+def _reported(row: Json) -> bool:
+    return bool(row["verdict"] != "no report")
+
+
 def _nameable(row: Json) -> bool:
     return _visible(row, NAMEABLE_STDS)
 
@@ -185,9 +190,14 @@ RATES: tuple[tuple[str, Callable[[Json], bool], Callable[[Json], Any], str], ...
     ("named first, sets allowed, size at least 6 std", _nameable, lambda r: r["first_with_sets"], ""),
     ("named first, sets allowed, all sizes", _single, lambda r: r["first_with_sets"], ""),
     ("named first, strictly, all sizes", _single, lambda r: r["first"], ""),
-    ("cases with a spurious name", lambda r: r["kind"] != "null", lambda r: bool(r["spurious"]), ""),
+    ("cases with a spurious name", lambda r: r["kind"] != "null" and _reported(r), lambda r: bool(r["spurious"]), ""),
     ("pairs: both found", lambda r: r["kind"] == "pair", lambda r: r["found"] == 2, ""),
-    ("false alarms, untouched recordings", lambda r: r["kind"] == "null", lambda r: r["false_alarm"], "<= 0.05"),
+    (
+        "false alarms, untouched recordings",
+        lambda r: r["kind"] == "null" and _reported(r),
+        lambda r: r["false_alarm"],
+        "<= 0.05",
+    ),
 )
 
 
