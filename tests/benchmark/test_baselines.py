@@ -137,7 +137,8 @@ def test_preparation_does_not_modify_the_car_of_the_case(null_case: Case) -> Non
 
 def test_diagnosis_and_baselines_are_scored_on_the_same_cases() -> None:
     def row(kind: str, true: list[str], named: list[str], excess: float) -> dict[str, object]:
-        return {"kind": kind, "true": true, "named": named, "excess": excess, "floor_ratio": 0.9}
+        given = {"kind": kind, "true": true, "named": named, "excess": excess}
+        return {**given, "implied": [], "reported": True, "floor_ratio": 0.9}
 
     rows = {
         "a": row("single", ["motor_lag"], ["motor_lag"], 2.0),
@@ -159,3 +160,14 @@ def test_diagnosis_and_baselines_are_scored_on_the_same_cases() -> None:
     assert ratio["GP residual"] == {"median": 0.5, "count": 2}
     assert ratio["cross-correlation"] is None
     assert all(len(cells) == 2 + len(BASELINES) for cells in comparison_rows(list(figures.values())))
+    rows["a"] = {**rows["a"], "named": [], "reported": False, "floor_ratio": None}
+    (ratio,) = (entry for entry in compare(rows, results) if entry["figure"].startswith("floor ratio"))
+    assert ratio["tool"] == {"median": 0.45, "count": 2}  # no gain in the case without a report
+
+
+def test_name_that_a_wrong_base_model_implies_is_no_false_alarm_of_a_baseline() -> None:
+    row = {"kind": "null", "true": [], "named": [], "excess": 0.0, "implied": ["tyre_saturation"], "reported": True}
+    result = {"named": "tyre_saturation", "score": 2.0, "refit_score": 3.0}
+    results = {"PySINDy": result, "stepwise BIC": {**result, "named": "yaw_damping"}}
+    alarms = next(entry for entry in compare({"a": row}, {"a": results}) if entry["figure"].startswith("false alarms"))
+    assert [alarms[name]["hits"] for name in ("tool", "PySINDy", "stepwise BIC")] == [0, 0, 1]

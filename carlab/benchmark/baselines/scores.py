@@ -19,7 +19,8 @@ def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -
 
     Args:
         rows: Rows by case, from ``score_cases``.
-        answers: Results of ``run_baselines`` by case; a failed case counts as no name and no gain.
+        answers: Results of ``run_baselines`` by case; a failed case counts as no name and no gain, as a missing report
+            does. Names that a wrong base model implies do not count.
 
     Returns:
         One entry for each figure: ``figure``, ``kind`` (rate or median) and, by column, hits and count or the median.
@@ -30,7 +31,8 @@ def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -
     def first(name: str, column: str) -> str | None:
         if column == "tool":
             return next(iter(rows[name]["named"]), None)
-        return (answers[name].get(column) or {}).get("named")
+        named: str | None = (answers[name].get(column) or {}).get("named")
+        return None if named in rows[name]["implied"] else named
 
     def rate(title: str, among: Callable[[Row], bool], hit: Callable[[Row, str | None], bool]) -> None:
         chosen = [name for name in names if among(rows[name])]
@@ -75,7 +77,7 @@ def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -
 def _floor_ratio(row: Row, answers: Mapping[str, Any], column: str) -> float | None:
     """(refit - corrected) / (refit - 1), each with its own refit."""
     if column == "tool":
-        return row.get("floor_ratio")
+        return row.get("floor_ratio") if row["reported"] else 0.0
     entry = answers.get(column)
     if entry is None:
         return 0.0

@@ -60,6 +60,7 @@ def score_case(
     implied = answer.get("implied_effects", ())
     named = [dict(e) for e in report["effects"] if e["id"] not in implied] if report is not None else []
     row["named"] = [e["id"] for e in named]
+    row["implied"] = list(implied)
     row["conditions"] = list(answer.get("conditions", ()))
     if answer["fault"] is not None:
         faults = [f.get("id") for f in (report or {}).get("data_faults", [])]
