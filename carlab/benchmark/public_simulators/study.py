@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -25,7 +23,7 @@ from carlab.benchmark.public_simulators.commonroad_effects import physics_of, tr
 from carlab.benchmark.public_simulators.study_page import TARGET_RATIO, study_page
 from carlab.benchmark.world.measurement import as_table, write_csv
 from carlab.core.errors import DataError
-from carlab.jobs.child_processes import run_child
+from carlab.jobs.child_jobs import ChildJob, run_job
 
 PACKAGE = "commonroad-vehicle-models"
 REPORT_FILES = ("report.json", "report.html", "model.toml")
@@ -173,19 +171,16 @@ def study(
 def _diagnose(
     handed: Path, command: Sequence[str], timeout_s: float, abandon: Callable[[], bool]
 ) -> dict[str, Any] | None:
-    with tempfile.TemporaryDirectory(prefix="diagnosis-") as fresh:
-        here = Path(fresh)
-        for file in FILES:
-            shutil.copyfile(handed / file, here / file)
-        arguments = [*command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out"]
-        end = run_child(arguments, here, timeout_s=timeout_s, abandon=abandon)
-        if end.abandoned:
-            return None
-        for file in REPORT_FILES:
-            (handed / file).unlink(missing_ok=True)
-            if (here / "out" / file).exists():
-                shutil.copyfile(here / "out" / file, handed / file)
-    return {"exit_status": end.exit_status, "seconds": round(end.seconds, 1), "words": end.output}
+    arguments = (*command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out")
+    inputs = {file: (handed / file).read_bytes() for file in FILES}
+    outputs = tuple(f"out/{file}" for file in REPORT_FILES)
+    done = run_job(ChildJob(arguments, timeout_s, inputs, outputs), abandon)
+    if done.end.abandoned:
+        return None
+    for file in REPORT_FILES:
+        (handed / file).unlink(missing_ok=True)
+    done.write_outputs(handed)
+    return {"exit_status": done.end.exit_status, "seconds": round(done.end.seconds, 1), "words": done.end.output}
 
 
 def _row(car: PublicCar, seed: int, run: dict[str, Any], path: Path) -> dict[str, Any]:
