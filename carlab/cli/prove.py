@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -31,6 +31,8 @@ STAGES = {
     "references": "references diagnosed",
     "answer": "cases answered",
 }
+FOR_RECORDINGS = ("data", "car", "tool")
+"""Options of ``--set real`` alone."""
 DAY_S = 86400.0
 
 
@@ -107,8 +109,7 @@ class Prove:
         above_zero(jobs=self.jobs, timeout=self.timeout)
         valid_seed(seed=self.seed)
         at_least(1, limit=self.limit)
-        if self.ray and self.simulator != "own":
-            raise ConfigError("--ray needs --simulator own; leave one of them out.")
+        self._check_options()
         if self.set == "real":
             return self._real()
         specs = self._specs()
@@ -128,6 +129,16 @@ class Prove:
                 fail(f"Stopped with {stages.last}; run the same command to continue.")
                 return 130
         return self._score(proof)
+
+    def _check_options(self) -> None:
+        """Raise ConfigError if an option is given that has no effect."""
+        use = f"--set {self.set}"
+        unused: tuple[str, ...] = ("calibrate",) if self.set == "real" else FOR_RECORDINGS
+        if self.simulator != "own":
+            use, unused = f"--simulator {self.simulator}", ("set", *FOR_RECORDINGS, "jobs", "ray", "calibrate")
+        for option in fields(self):
+            if option.name in unused and getattr(self, option.name) != option.default:
+                raise ConfigError(f"--{option.name} has no effect with {use}; leave it out.")
 
     def _real(self) -> int:
         from carlab.benchmark.real.runner import RealProof, Tool, drawn_specs

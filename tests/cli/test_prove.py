@@ -127,6 +127,22 @@ def test_numbers_out_of_range_are_refused(tmp_path: Path, carlab: Carlab) -> Non
     assert not (tmp_path / "proof").exists()
 
 
+def test_options_without_effect_are_refused(tmp_path: Path, carlab: Carlab) -> None:
+    for option, *options in (
+        ("--calibrate", "--calibrate", "--set", "real"),
+        ("--calibrate", "--calibrate", "--simulator", "commonroad"),
+        ("--set", "--set", "real", "--simulator", "commonroad-drift"),
+        ("--ray", "--ray", "local", "--simulator", "commonroad"),
+        ("--jobs", "--jobs", 2, "--simulator", "commonroad"),
+        ("--data", "--data", tmp_path, "--car", "rc_car"),
+        ("--tool", "--tool", "compare", "--set", "full"),
+    ):
+        code, text = carlab("prove", "--out", tmp_path / "proof", *options)
+        assert code == 2
+        assert f"{option} has no effect with --" in text
+    assert not (tmp_path / "proof").exists()
+
+
 # The diagnosis waits for a file, so that the test decides when it ends.
 PROOF_WITH_WAITING_DIAGNOSIS = """
 import sys
