@@ -203,6 +203,13 @@ def test_tool_sees_files_without_the_answer(recordings: dict[str, dict[str, np.n
     assert {row[0]: row[2] for row in rate_rows(rows)}["false alarms, untouched recordings"] == "1/1"
     assert kind_rows(rows.values()) == [("steering_offset", "-", "-", "1/1", f"{int(size['covered'])}/1")]
     assert "nothing: answered steering_offset" in real_results_page({"seed": "0"}, rows, proof.reports())
+    name, table = next(iter(recordings.items()))
+    drifted = {**recordings, name: {**table, "vx": 1.01 * table["vx"]}}
+    other_car = tmp_path / "other.toml"
+    other_car.write_text(car.read_text().replace("0.42", "0.5"))
+    for others in ((recordings, other_car), (drifted, car)):
+        with pytest.raises(DataError, match="proof of other cases or files"):
+            RealProof(proof.root, specs, *others, tool=Tool("compare", FAKE), command=FAKE).make()
     handed = proof.root / "handed" / next(iter(rows)) / "other_1.csv"
     handed.write_text(handed.read_text().replace("0", "1", 1))
     with pytest.raises(DataError, match="seal is broken"):

@@ -69,7 +69,9 @@ class SealedRun:
             write_json(path, {"plan": self._plan, "names": [new_name() for _ in self._plan]})
         kept = read_json(path)
         if kept["plan"] != self._plan:
-            raise DataError(f"{self.root} contains a proof of other cases; use the same cases or another folder.")
+            raise DataError(
+                f"{self.root} contains a proof of other cases or files; use the same ones or another folder."
+            )
         return list(kept["names"])
 
     def seal(self) -> str:

@@ -10,6 +10,7 @@ Folder of a proof, in addition to that of ``SealedRun``:
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from typing import Any, Literal
 import tomli_w
 
 from carlab.benchmark.cases.proof_set import drawn
+from carlab.benchmark.cases.seal import file_digest
 from carlab.benchmark.effects.data_faults import Table
 from carlab.benchmark.proof.sealed_run import SealedRun
 from carlab.benchmark.proof.worker import read_json, write_json
@@ -34,6 +36,7 @@ from carlab.benchmark.real.cases import (
     write_tables,
 )
 from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
+from carlab.benchmark.world.measurement import COLUMNS
 from carlab.core.errors import ConfigError, DataError
 from carlab.jobs.child_jobs import CARLAB, ChildJob
 from carlab.jobs.child_processes import ChildEnd
@@ -91,7 +94,7 @@ class RealProof(SealedRun):
         command: Sequence[str] = CARLAB,
         **options: Any,
     ) -> None:
-        super().__init__(root, _plan(specs, recordings, tool), **options)
+        super().__init__(root, _plan(specs, recordings, car, tool), **options)
         self.specs = list(specs)
         self.recordings = {name: with_full_lock(table) for name, table in recordings.items()}
         self.car = car
@@ -218,6 +221,15 @@ def drawn_specs(seed: int, limit: int | None, recordings: Mapping[str, Table]) -
     return usable if limit is None else drawn(usable, limit, seed), sorted(refused - allowed)
 
 
-def _plan(specs: Sequence[RealCaseSpec], recordings: Mapping[str, Table], tool: Tool) -> list[dict[str, Any]]:
-    rules = {"recordings": sorted(recordings), "tool": tool.verb, "piece_s": PIECE_S, "max_parts": MAX_PARTS}
+def _plan(
+    specs: Sequence[RealCaseSpec], recordings: Mapping[str, Table], car: Path, tool: Tool
+) -> list[dict[str, Any]]:
+    rules = {
+        "recordings": {name: _digest(table) for name, table in recordings.items()},
+        "car": file_digest(car), "tool": tool.verb, "piece_s": PIECE_S, "max_parts": MAX_PARTS,
+    }  # fmt: skip
     return [*(spec.as_dict() for spec in specs), rules]
+
+
+def _digest(table: Table) -> str:
+    return hashlib.sha256(b"".join(table[name].tobytes() for name in COLUMNS)).hexdigest()
