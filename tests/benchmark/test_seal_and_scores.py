@@ -16,6 +16,7 @@ from carlab.benchmark.cases.seal import check, digest, new_nonce
 from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.case_score import score_case, valid_set
 from carlab.benchmark.proof.detection import spurious_curves
+from carlab.benchmark.proof.results_page import failures
 from carlab.benchmark.proof.runner import Proof
 from carlab.benchmark.proof.scores import (
     confusion,
@@ -142,6 +143,20 @@ def test_missing_report_is_a_miss_and_wrong_schema_an_error() -> None:
     assert not row["reported"]
     with pytest.raises(DataError, match="schema"):
         score_case(answer(), report("steering_lag") | {"schema": "carlab.diagnosis/9"})
+
+
+def test_failures_state_the_reason_of_a_missing_report() -> None:
+    row = score_case(answer(), None)
+    runs = {
+        "a": {"exit_status": None, "words": "worker lost: the node died"},
+        "b": {"exit_status": None, "words": "ended after 1800 s"},
+        "c": {"exit_status": -9, "words": "reading\nKilled"},
+    }
+    assert failures(dict.fromkeys(runs, row), runs).splitlines() == [
+        "* a: single steering_lag: no report: worker lost: the node died",
+        "* b: single steering_lag: no report: ended after 1800 s",
+        "* c: single steering_lag: no report (exit status -9): Killed",
+    ]
 
 
 def test_missing_report_is_no_evidence_against_false_alarms_and_no_correct_verdict() -> None:

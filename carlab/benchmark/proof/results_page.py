@@ -50,7 +50,7 @@ def results_page(
         (name, f"{e['strict']}/{e['alone']}", f"{e['with_sets']}/{e['alone']}", f"{e['named']}/{e['cases']}")
         for name, e in per_effect(rows.values()).items()
     ]
-    columns = ("effect", "alone: strictly first", "alone: first, with sets", "named, also beside others")
+    columns = ("effect", "alone: strictly first", "alone: first, with sets", "named, alone or with others")
     parts += ["## Each effect", markdown(columns, effects)]
     parts += ["## Failures", failures(rows, runs)]
     return "\n\n".join(parts) + "\n"
@@ -67,8 +67,9 @@ def failures(rows: Mapping[str, Row], runs: Mapping[str, Mapping[str, Any]]) -> 
         strength += "".join(f", {condition}" for condition in row["conditions"])
         if not row["reported"]:
             words = str(run.get("words", "")).strip().splitlines()
-            why = "took too long" if run.get("exit_status") is None else f"exit status {run['exit_status']}"
-            lines.append(f"* {name}: {row['kind']} {true}: no report ({why}): {words[-1] if words else ''}")
+            status = run.get("exit_status")  # None after a time-out or the loss of a worker, which the words state
+            why = "" if status is None else f" (exit status {status})"
+            lines.append(f"* {name}: {row['kind']} {true}: no report{why}: {words[-1] if words else ''}")
         elif not right(row):
             lines.append(f"* {name}: {row['kind']} {true}{strength}: answered {answered}")
     return "\n".join(lines) or "None."

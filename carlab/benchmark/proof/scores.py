@@ -28,8 +28,8 @@ def _strong(row: Row) -> bool:
 
 # (figure, key of the row, which rows count, target)
 RATES: tuple[tuple[str, str, Callable[[Row], bool], str], ...] = (
-    ("correct effect first, sets allowed, excess >= 1", "set_top1", _strong, ">= 0.90"),
-    ("correct effect first, strictly, excess >= 1", "strict_top1", _strong, ">= 0.75"),
+    ("correct effect first, sets allowed, excess >= 1", "set_top1", _strong, ">= 0.97"),
+    ("correct effect first, strictly, excess >= 1", "strict_top1", _strong, ">= 0.92"),
     ("correct effect first, sets allowed, all strengths", "set_top1", lambda r: True, ">= 0.75"),
     ("correct effect first, strictly, all strengths", "strict_top1", lambda r: True, ""),
     ("correct effect first, strictly, catalogue's form", "strict_top1", lambda r: r["form"] == "catalogue", ""),
