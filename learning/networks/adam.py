@@ -1,8 +1,7 @@
 """Adam for one tensor of parameters, in place: torch's fused kernel without the overhead of ``torch.optim``.
 
-Kingma and Ba 2015 ("Adam: A Method for Stochastic Optimization"), with decoupled weight decay as in Loshchilov and
-Hutter 2019 ("Decoupled Weight Decay Regularization"). For networks of a few thousand parameters this overhead is a
-large part of a step.
+Kingma and Ba 2015 ("Adam: A Method for Stochastic Optimization"). For networks of a few thousand parameters this
+overhead is a large part of a step.
 """
 
 from __future__ import annotations
@@ -21,13 +20,11 @@ class Adam:
 
     Attributes:
         parameters: of any shape; changed in place.
-        weight_decay: decoupled from the gradient; the learning rate multiplies it.
         second: beta_2.
         mean, square: moments of the gradient, in the shape of the parameters.
     """
 
     parameters: Tensor
-    weight_decay: float = 0.0
     second: float = BETA_2
     mean: Tensor = field(init=False)
     square: Tensor = field(init=False)
@@ -50,7 +47,7 @@ class Adam:
         self._steps += 1.0
         torch._fused_adamw_(
             [self.parameters], [gradient], [self.mean], [self.square], [], [self._steps],
-            lr=rate, beta1=BETA_1, beta2=self.second, weight_decay=self.weight_decay, eps=EPSILON,
+            lr=rate, beta1=BETA_1, beta2=self.second, weight_decay=0.0, eps=EPSILON,
             amsgrad=False, maximize=False,
         )  # fmt: skip
 

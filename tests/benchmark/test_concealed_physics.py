@@ -84,8 +84,7 @@ def test_catalogue_forms_equal_the_effects_of_the_simulator(form: Form) -> None:
     world = World(car)
     form.attach(world, parameters)
     generated = generator_drive(world, table, start).rows
-    simulator_parameters = {k: v for k, v in parameters.items() if k != "all_axles"}
-    simulated = simulator_rollout(car, {form.id: simulator_parameters}, table, start).states[0].numpy()
+    simulated = simulator_rollout(car, {form.id: parameters}, table, start).states[0].numpy()
     null = generator_drive(World(car), table, start).rows
     influence = np.abs(generated - null).max(axis=0) / NOISE_FLOOR
     difference = np.abs(generated - simulated).max(axis=0) / NOISE_FLOOR

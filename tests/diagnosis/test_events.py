@@ -38,7 +38,7 @@ def test_blow_changes_the_velocity_of_a_free_body_by_its_impulse() -> None:
 
 
 def _without_tyres(now: Instant) -> None:
-    now.ff = now.fr = now.fx_front = 0.0
+    now.ff = now.fr = 0.0
     now.push_x -= now.fx
 
 

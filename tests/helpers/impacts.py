@@ -65,7 +65,7 @@ class Lift:
 
         def release_tyres(now: Instant) -> None:
             if is_held(now):
-                now.ff = now.fr = now.fx = now.fx_front = 0.0
+                now.ff = now.fr = now.fx = 0.0
 
         def hold(now: Instant) -> None:
             if not is_held(now):

@@ -31,8 +31,7 @@ class Steps:
 
     ``starts`` (M, 6), ``rows`` (M,) of the recording where they begin, ``t_s`` their times (M,) [s], ``fine`` the
     acting commands of the whole recording by substeps (N n, 2), ``parts`` the n substeps of a period [s] (n,),
-    ``count`` rows in a step. ``ends`` (M, 6)
-    is where the refitted model gets, ``changed`` where it gets with other commands.
+    ``count`` rows in a step, ``ends`` (M, 6) where the refitted model gets.
     """
 
     car: BaseCar

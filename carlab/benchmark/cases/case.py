@@ -105,7 +105,6 @@ def make_case(
     period_s: float = 1.0 / 30.0,
     fit_s: float = 100.0,
     hold_s: float = 40.0,
-    true_starts: bool = False,
     conditions: Conditions = PLAIN,
 ) -> Case:
     """Draw, size and record one case. The same arguments give the same case.
@@ -122,7 +121,6 @@ def make_case(
         period_s: Control period: 1/30 s, or 1/100 s.
         fit_s: Length of the recording to fit [s].
         hold_s: Length of the held-out recording [s].
-        true_starts: Measure the excess from noise-free initial states; the floor is then the recording's noise.
         conditions: Conditions of driving, recording and car file.
 
     Raises:
@@ -131,7 +129,7 @@ def make_case(
     forms = _checked_forms(kind, effects, form, fault)
     linear = any(f.nominal_kind == "linear_tyre" for f in forms)
     scene = Scene(
-        seed, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s, true_starts=true_starts,
+        seed, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s,
         feedback_only=conditions.feedback_only, is_null=kind == "null",
     )  # fmt: skip
     found = [scene.sized(f, excess) for f in forms]

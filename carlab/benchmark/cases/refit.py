@@ -69,7 +69,7 @@ class Refit:
 
 
 def fine_commands(
-    recording: Recording, car: BaseCar, changes: Sequence[CommandChange] = (), shift_s: float = 0.0
+    recording: Recording, car: BaseCar, changes: Sequence[CommandChange] = ()
 ) -> tuple[FloatArray, FloatArray]:
     """Mean acting commands over every substep, at the times of the captured states (N n, 2), and substeps of a period.
 
@@ -77,7 +77,7 @@ def fine_commands(
     commands switch.
     """
     period = car.control_period
-    age = car.command_delay + car.latency + shift_s
+    age = car.command_delay + car.latency
     switch = age % period
     before = max(1, round(_SUBSTEPS_PER_PERIOD * switch / period)) if switch > 1e-6 else 0
     after = max(1, _SUBSTEPS_PER_PERIOD - before)
@@ -101,9 +101,7 @@ def cut_windows(
     *,
     every_s: float = 0.5,
     horizon_s: float = HORIZON_S,
-    true_starts: bool = False,
     changes: Sequence[CommandChange] = (),
-    shift_s: float = 0.0,
 ) -> Windows:
     """Cut a recording into windows; ``car`` propagates the errors of initial states over the horizon."""
     period = car.control_period
@@ -112,20 +110,14 @@ def cut_windows(
     last = first + steps
     window = 9 if period > 0.02 else 2 * round(0.133 / period) + 1
     clean = recording.clean
-    if true_starts:
-        starts = clean[first]
-    else:
-        pose, slope = local_fit(recording.measured[:, :3], window, 3, period)
-        starts = np.concatenate([pose, to_body(pose[:, 2], slope)], axis=1)[first]
-    fine, parts = fine_commands(recording, car, changes, shift_s)
+    pose, slope = local_fit(recording.measured[:, :3], window, 3, period)
+    starts = np.concatenate([pose, to_body(pose[:, 2], slope)], axis=1)[first]
+    fine, parts = fine_commands(recording, car, changes)
     commands = fine[first[:, None] * len(parts) + np.arange(steps * len(parts))]
     steps_s = np.tile(parts, steps)
-    floor_errors = in_start_frame(clean[last] - recording.measured[last], starts)
-    if not true_starts:
-        grown = roll(car, car.free(), starts, commands, steps_s) - roll(
-            car, car.free(), clean[first], commands, steps_s
-        )
-        floor_errors = floor_errors + in_start_frame(grown, starts)
+    grown = roll(car, car.free(), starts, commands, steps_s) - roll(car, car.free(), clean[first], commands, steps_s)
+    measured_error = in_start_frame(clean[last] - recording.measured[last], starts)
+    floor_errors = measured_error + in_start_frame(grown, starts)
     return Windows(car, steps_s, starts, commands, recording.measured[last], floor_errors)
 
 

@@ -54,7 +54,6 @@ class Scene:
         model: Literal["dynamic", "linear_tyre"],
         lengths_s: tuple[float, float],
         period_s: float,
-        true_starts: bool = False,
         feedback_only: bool = False,
         is_null: bool = False,
     ) -> None:
@@ -64,7 +63,7 @@ class Scene:
         self.car = self.nominal if is_null else moved
         self.track = Track(draws)
         self.noise = Noise(self.nominal.position_std, self.nominal.yaw_std, float(draws.choice((0.06, 0.075, 0.09))))
-        self.seed, self.lengths_s, self.true_starts = seed, lengths_s, true_starts
+        self.seed, self.lengths_s = seed, lengths_s
         self.draws, self.feedback_only = draws, feedback_only
         self._last: tuple[tuple[Concealed, ...], Driven] | None = None
 
@@ -92,7 +91,7 @@ class Scene:
             human = self.human(part)
             what = drive(world, human, length_s, start=human.start())
             recordings.append(record(what, world, self.noise, np.random.default_rng((self.seed, 3, part))))
-            windows.append(cut_windows(recordings[-1], self.car, true_starts=self.true_starts))
+            windows.append(cut_windows(recordings[-1], self.car))
         fitted = refit(windows[0], windows[1], self.nominal)
         return fitted, tuple(recordings), windows[1]
 

@@ -43,11 +43,11 @@ def battery_sag(world: World, p: Parameters) -> None:
 
 
 def traction_limit(world: World, p: Parameters) -> None:
-    """F_x at the driven axle at most a share of its friction; ``all_axles`` is 1 with all-wheel drive."""
-    share, every = p["share"], p.get("all_axles", 0.0) > 0.5
+    """F_x at the driven rear axle at most a share of its friction."""
+    share = p["share"]
 
     def limit(now: Instant) -> None:
-        top = now.mu_r * now.fz_r + (now.mu_f * now.fz_f if every else 0.0)
+        top = now.mu_r * now.fz_r
         now.fx = min(max(now.fx, -share * top), share * top)
 
     world.hooks["limit"].append(limit)
@@ -137,8 +137,7 @@ FORMS = (
         "traction_limit",
         "catalogue",
         lambda size, draw: {
-            "share": (2.0 * draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear)) * math.exp(-size),
-            "all_axles": 0.0,
+            "share": (2.0 * draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear)) * math.exp(-size)
         },
         traction_limit,
         1.2,

@@ -30,7 +30,7 @@ class Instant:
     """
 
     __slots__ = (
-        "alpha_f", "alpha_r", "cos_d", "d", "drive", "extra", "ff", "fr", "fx", "fx_front", "fz_f", "fz_r", "moment",
+        "alpha_f", "alpha_r", "cos_d", "d", "drive", "extra", "ff", "fr", "fx", "fz_f", "fz_r", "moment",
         "mu_f", "mu_r", "psi", "push_x", "push_y", "r", "rates", "shape_f", "shape_r", "sin_d", "t", "u", "vx", "vy",
         "x", "y",
     )  # fmt: skip
@@ -48,7 +48,6 @@ class Instant:
     cos_d: float
     drive: float
     fx: float
-    fx_front: float
     fz_f: float
     fz_r: float
     mu_f: float
@@ -155,7 +154,6 @@ class Derivative:
         for hook in drive:
             hook(now)
         now.fx = now.drive - car.damping * vx
-        now.fx_front = 0.0
         front_y = vy + front_axle * r
         now.alpha_f = math.atan2(front_y * cos_d - vx * sin_d, max(abs(vx * cos_d + front_y * sin_d), SLIP_FLOOR_MPS))
         now.alpha_r = math.atan2(vy - rear_axle * r, max(abs(vx), SLIP_FLOOR_MPS))
@@ -184,9 +182,9 @@ class Derivative:
         m, car = self._mass, self._world.car
         ff, sin_d, cos_d = now.ff, now.sin_d, now.cos_d
         if not self._kinematic:
-            side = ff * cos_d + now.fx_front * sin_d
+            side = ff * cos_d
             dynamic = (
-                (now.fx + now.fx_front * cos_d - ff * sin_d + now.push_x) / m + now.vy * now.r,
+                (now.fx - ff * sin_d + now.push_x) / m + now.vy * now.r,
                 (now.fr + side + now.push_y) / m - now.vx * now.r,
                 (car.front_axle * side - car.rear_axle * now.fr + now.moment) / self._inertia,
             )
