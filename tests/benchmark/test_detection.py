@@ -52,6 +52,21 @@ def test_valid_set_finds_an_effect_but_not_strictly() -> None:
     assert (row["detections"][0]["found"], row["detections"][0]["strict"]) == (True, False)
 
 
+def test_one_name_finds_one_of_two_effects_of_its_set() -> None:
+    pair = ("throttle_nonlinearity", "traction_limit")
+    set_of_both = report("motor_saturation", others=pair)
+    row = score_case(answer("pair", *pair), set_of_both)
+    assert not row["both_found"]
+    assert sum(d["found"] for d in row["detections"]) == 1
+    two = report("throttle_nonlinearity", "motor_saturation", others=("traction_limit",))
+    two["effects"][0]["indistinguishable_from"] = []
+    assert score_case(answer("pair", *pair), two)["both_found"]
+    # The true car has one effect; the report states two, of which one is right.
+    again = report("steering_lag", "steering_delay", others=("steering_lag",))
+    again["effects"][0]["indistinguishable_from"] = []
+    assert score_case(answer("single", "steering_lag"), again)["names_right"] == [True, False]
+
+
 def test_linear_base_model_implies_tyre_saturation() -> None:
     linear = {"conditions": ["base model linear_tyre"], "implied_effects": ["tyre_saturation"]}
     row = score_case(answer("single", "steering_lag", **linear), report("tyre_saturation", "steering_lag"))

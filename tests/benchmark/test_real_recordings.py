@@ -249,6 +249,11 @@ def test_sets_and_spurious_names() -> None:
     assert (row["first"], row["first_with_sets"], row["spurious"]) == (False, True, [])
     two = score_comparison(truth, report(("motor_lag", "time_constant", 0.1), ("steering_delay", "delay", 0.07)), {})
     assert (two["first_with_sets"], two["found"], two["spurious"]) == (False, 1, ["motor_lag"])
+    pair = {**truth, "kind": "pair", "effects": [*truth["effects"], *answer("motor_lag", ["motor_lag"])["effects"]]}
+    both = score_comparison(
+        pair, report(("steering_lag", "time_constant", 0.1), others=("steering_delay", "motor_lag")), {}
+    )
+    assert (both["found"], both["spurious"]) == (1, [])
     none = score_comparison(truth, None, {})
     assert (none["first"], none["verdict"]) == (False, "no report")
     untouched = {"kind": "null", "part": [], "effects": []}

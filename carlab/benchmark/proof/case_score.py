@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from carlab.benchmark.effects.catalogue import CONFUSABLE
+from carlab.benchmark.proof.matching import Correctness, assigned
 from carlab.core.errors import DataError
 
 SCHEMA = "carlab.diagnosis/1"
@@ -79,7 +81,7 @@ def _criteria_of_kind(
     if kind == "single":
         _single(row, answer, named, same)
     elif kind == "pair":
-        found = [any(_found(e, true, same) for e in named) for true in row["true"]]
+        found, _ = assigned(row["true"], named, partial(_correctness, same=same))
         strict = [true in row["named"] for true in row["true"]]
         row["both_found"], row["both_strict"] = all(found), all(strict)
     elif kind == "multiple":
@@ -107,25 +109,25 @@ def valid_set(effect: Json, same: SeparationTest | None = None) -> bool:
     return same is None or all(same(effect["id"], other) is not False for other in others)
 
 
-def _found(effect: Json, true: str, same: SeparationTest | None) -> bool:
+def _correctness(effect: Json, true: str, same: SeparationTest | None) -> Correctness:
     if effect["id"] == true:
-        return True
-    return true in (effect.get("indistinguishable_from") or []) and valid_set(effect, same)
+        return "exact"
+    in_set = true in (effect.get("indistinguishable_from") or []) and valid_set(effect, same)
+    return "in set" if in_set else "wrong"
+
+
+def _found(effect: Json, true: str, same: SeparationTest | None) -> bool:
+    return _correctness(effect, true, same) != "wrong"
 
 
 def _detections(row: dict[str, Any], answer: Json, named: list[dict[str, Any]], same: SeparationTest | None) -> None:
-    """Whether each concealed effect is named, at any rank, and whether each name is right."""
+    """Whether each concealed effect is named, at any rank, and whether each name is right; a name counts once."""
+    found, row["names_right"] = assigned(row["true"], named, partial(_correctness, same=same))
     excesses = answer.get("single_excesses") or [answer["excess"]] * len(row["true"])
     row["detections"] = [
-        {
-            "id": true,
-            "excess": excess,
-            "found": any(_found(e, true, same) for e in named),
-            "strict": true in row["named"],
-        }
-        for true, excess in zip(row["true"], excesses, strict=True)
+        {"id": true, "excess": excess, "found": is_found, "strict": true in row["named"]}
+        for true, excess, is_found in zip(row["true"], excesses, found, strict=True)
     ]
-    row["names_right"] = [any(_found(e, true, same) for true in row["true"]) for e in named]
 
 
 def _single(row: dict[str, Any], answer: Json, named: list[dict[str, Any]], same: SeparationTest | None) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
 
 from carlab.benchmark.intervals import wilson
+from carlab.benchmark.proof.matching import Correctness, assigned
 from carlab.benchmark.proof.results_page import markdown
 from carlab.core.errors import DataError
 
@@ -35,8 +36,8 @@ def score_comparison(answer: Json, report: Json | None, model: Json, seconds: fl
 
     Returns:
         A flat table. ``first`` and ``first_with_sets``: the first name is correct (of a pair: one of both); ``found``:
-        concealed effects that are named or in a set; ``spurious``: names that are not concealed. Rates of false alarms
-        and spurious names leave cases without a report out.
+        concealed effects that are named or in a set, each by another name; ``spurious``: names that are not concealed.
+        Rates of false alarms and spurious names leave cases without a report out.
 
     Raises:
         DataError: the report has another schema.
@@ -60,7 +61,7 @@ def score_comparison(answer: Json, report: Json | None, model: Json, seconds: fl
     in_set = [{change["id"], *(change.get("indistinguishable_from") or [])} for change in changes]
     row["first"] = bool(changes) and any(changes[0]["id"] in names for names in true)
     row["first_with_sets"] = bool(changes) and any(in_set[0] & names for names in true)
-    row["found"] = sum(any(members & names for members in in_set) for names in true)
+    row["found"] = sum(assigned(true, changes, _correctness)[0])
     row["spurious"] = [
         c["id"] for c, members in zip(changes, in_set, strict=True) if not any(members & n for n in true)
     ]
@@ -74,6 +75,12 @@ def score_comparison(answer: Json, report: Json | None, model: Json, seconds: fl
     if len(answer["effects"]) == 1 and not row["sizes"]:
         row["unnamed_stds"] = _unnamed_stds(answer["effects"][0], report, model)
     return row
+
+
+def _correctness(change: Json, names: Set[str]) -> Correctness:
+    if change["id"] in names:
+        return "exact"
+    return "in set" if names & set(change.get("indistinguishable_from") or []) else "wrong"
 
 
 def _unnamed_stds(effect: Json, report: Json | None, model: Json) -> float | None:
