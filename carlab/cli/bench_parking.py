@@ -155,13 +155,13 @@ def _stored(end: JobEnd, runs: Path) -> Path:
 
 
 def _curves(runs: Sequence[_Run], options: BenchOptions) -> list[Curve]:
-    """Curves of the runs that exist, method by method."""
+    """Curves of the runs that exist, method by method; a longer run counts up to the last episode of the study."""
     from carlab.studies.parking import read_curve, run_folder
 
     names = list(dict.fromkeys(run.method for run in runs))
     folders = [(run, run_folder(options.runs, run.label, run.seed)) for run in runs]
     curves = [
-        replace(read_curve(folder), method=run.method, reality=run.reality)
+        replace(read_curve(folder, options.episodes), method=run.method, reality=run.reality)
         for run, folder in folders
         if folder is not None
     ]

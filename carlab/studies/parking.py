@@ -116,13 +116,14 @@ def _plan(folder: Path) -> dict[str, Any]:
         raise DataError(f"{folder} is not a run of carlab learn ({error}); remove it.") from error
 
 
-def read_curve(folder: Path) -> Curve:
-    """Read the figures of a run. Raises DataError if the folder is not a run of carlab learn."""
+def read_curve(folder: Path, last_episode: int | None = None) -> Curve:
+    """Read the figures of a run up to an episode. Raises DataError if the folder is not a run of carlab learn."""
     plan = _plan(folder)
     try:
         rows = read_json(folder / CURVE_FILE)["episodes"]
-        episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
-        return Curve(method_of(plan), int(plan["seed"]), int(plan["updates"]), tuple(episodes))
+        found = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
+        episodes = tuple(e for e in found if last_episode is None or e.episode <= last_episode)
+        return Curve(method_of(plan), int(plan["seed"]), int(plan["updates"]), episodes)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{folder} is not a run of carlab learn with figures ({error}); remove it.") from error
 

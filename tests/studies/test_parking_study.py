@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carlab.cli.bench_options import BenchOptions
+from carlab.cli.bench_parking import _curves, _runs
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.method_names import with_current_methods
 from carlab.experiment.campaign.figures import EpisodeFigures
@@ -56,6 +58,15 @@ def test_summary_equals_hand_computed_values(runs: list[Path]) -> None:
     assert sim_fsvgd.parked_at_last == pytest.approx((2 / 3 + 1 / 3 + 1.0) / 3.0)
     assert sim_fsvgd.seconds_an_episode == pytest.approx(60.0)
     assert authors.minutes == pytest.approx(3.0)
+
+
+def test_a_longer_run_counts_up_to_the_last_episode_of_the_study(runs: list[Path]) -> None:
+    options = BenchOptions("parking", methods=("gp-sim-posterior", "fsvgd"), seeds=3, episodes=2, runs=runs[0].parent)
+    sim_fsvgd, authors = summarised(_curves(_runs(options), options))
+    assert (sim_fsvgd.episodes, authors.episodes) == (2, 2)
+    assert sim_fsvgd.first_parked == (2, None, 1)
+    assert authors.first_parked == (None, None)
+    assert sim_fsvgd.parked_at_last == pytest.approx((1 / 2 + 0.0 + 1.0) / 3.0)
 
 
 def test_missing_episode_row_does_not_shift_other_episodes(tmp_path: Path) -> None:
