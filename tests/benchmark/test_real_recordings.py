@@ -243,6 +243,18 @@ def test_size_is_added_to_the_model_of_the_reference() -> None:
     assert row["sizes"][0]["stds"] == pytest.approx(4.0)
 
 
+def test_size_of_the_other_correct_name_is_added_to_its_own_parameter() -> None:
+    # A delay of both commands and a latency give the same recording; the car file has values of both.
+    model = {"mocap": {"latency": 0.008}, "effects": {"command_delay": {"extra_delay": 0.07}}}
+    names = {"command_delay": "extra_delay", "mocap_latency": "latency"}
+    for concealed, parameter in names.items():
+        truth = answer(concealed, list(names), parameter=parameter, size=0.045)
+        for named, true in (("command_delay", 0.115), ("mocap_latency", 0.053)):
+            row = score_comparison(truth, report((named, names[named], true + 0.001)), model)
+            assert row["sizes"][0]["true"] == pytest.approx(true)
+            assert row["sizes"][0]["covered"]
+
+
 def test_sets_and_spurious_names() -> None:
     truth = answer("steering_delay", ["steering_delay"])
     row = score_comparison(truth, report(("steering_lag", "time_constant", 0.1), others=("steering_delay",)), {})

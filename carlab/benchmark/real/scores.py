@@ -99,19 +99,19 @@ def _sizes(effect: Json, change: Json, model: Json) -> list[dict[str, Any]]:
     """True and estimated value of each parameter of a named effect."""
     found = []
     estimates = change["parameters"]
-    for truth in effect["truth"]:
-        estimate = estimates.get(truth["parameter"]) or (
-            next(iter(estimates.values())) if len(estimates) == 1 else None
-        )
-        if estimate is None:
+    for concealed in effect["truth"]:
+        # Another correct name has another name of its only parameter.
+        parameter = concealed["parameter"] if len(estimates) > 1 else next(iter(estimates), "")
+        if parameter not in estimates:
             continue
-        before = _before(change["id"], truth["parameter"], model)
+        estimate, truth = estimates[parameter], {**concealed, "parameter": parameter}
+        before = _before(change["id"], parameter, model)
         value = true_value(truth, change["id"], model)
         size = abs(value - before)
         if "reference" in change:  # a comparison reports changes
             value = _true_change(truth, change, value - before)
         found.append({
-            "parameter": f"{change['id']}.{truth['parameter']}", "true": value, "value": estimate["value"],
+            "parameter": f"{change['id']}.{parameter}", "true": value, "value": estimate["value"],
             "std": estimate["std"], "covered": estimate["low90"] <= value <= estimate["high90"],
             "stds": size / max(estimate["std"], 1e-12),
         })  # fmt: skip
