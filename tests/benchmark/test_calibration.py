@@ -43,6 +43,15 @@ def test_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_n
     assert [r.is_present_value for r in calibrate(ANSWERS, DECISIONS) if r.value == 20.0] == [True]
 
 
+def test_names_that_a_wrong_base_model_implies_are_not_false() -> None:
+    answers = {"a": {"effects": [{"id": "steering_lag"}], "implied_effects": ["tyre_saturation"]}}
+    made = {
+        "a": content(*(decision("accept", name, 35.0, step=k) for k, name in enumerate(("tyre_saturation", "drag"))))
+    }
+    (present,) = (r for r in calibrate(answers, made) if r.setting == CHI2 and r.is_present_value)
+    assert (present.false_names, present.false_opportunities) == (1, 1)
+
+
 def test_settings_have_their_present_names_in_decisions_of_earlier_versions() -> None:
     former = json.loads(json.dumps(DECISIONS).replace(SHARE, "selection.accept_unseen_share"))
     assert calibrate(ANSWERS, former) == calibrate(ANSWERS, DECISIONS)

@@ -29,6 +29,8 @@ COLUMNS = ("threshold", "value", "false names", "missed names")
 class Rates:
     """Outcome of the decisions that use one setting, at one value of it.
 
+    Names that a wrong base model implies are neither false nor missed.
+
     false_names          accepted names that are not concealed
     false_opportunities  decisions in which such a name may be accepted
     missed_names         decisions in which a concealed name may be accepted, but no name is
@@ -61,12 +63,16 @@ def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, A
         Rates by setting, in the order of the values.
     """
     cases = [
-        ({effect["id"] for effect in answers[name]["effects"]}, _with_present_settings(content["decisions"]))
+        (
+            {effect["id"] for effect in answers[name]["effects"]},
+            set(answers[name].get("implied_effects", ())),
+            _with_present_settings(content["decisions"]),
+        )
         for name, content in sorted(decisions.items())
         if content.get("schema") == SCHEMA
     ]
     present = {
-        condition["setting"]: float(condition["threshold"]) for _, made in cases for condition in _conditions(made)
+        condition["setting"]: float(condition["threshold"]) for *_, made in cases for condition in _conditions(made)
     }
     return [
         _rates(cases, setting, factor * threshold, factor == 1.0)
@@ -94,10 +100,10 @@ def _conditions(decisions: Iterable[Mapping[str, Any]]) -> Iterable[Mapping[str,
 
 
 def _rates(
-    cases: Sequence[tuple[set[str], list[dict[str, Any]]]], setting: str, value: float, is_present_value: bool
+    cases: Sequence[tuple[set[str], set[str], list[dict[str, Any]]]], setting: str, value: float, is_present_value: bool
 ) -> Rates:
     false_names = false_opportunities = missed_names = true_opportunities = 0
-    for concealed, made in cases:
+    for concealed, implied, made in cases:
         for key, group in groupby(made, key=lambda d: (d["stage"], d["step"])):
             decided = list(group)
             if not any(c["setting"] == setting for c in _conditions(decided)):
@@ -105,11 +111,11 @@ def _rates(
             steps = [decided] if key[0] == "accept" else [[decision] for decision in decided]
             for step in steps:
                 has_true = any(d["effect"] in concealed for d in step)
-                has_wrong = any(d["effect"] not in concealed for d in step)
+                has_wrong = any(d["effect"] not in concealed | implied for d in step)
                 accepted = next((d["effect"] for d in step if passes(d, setting, value)), None)
                 false_opportunities += has_wrong
                 true_opportunities += has_true
-                false_names += accepted is not None and accepted not in concealed
+                false_names += accepted is not None and accepted not in concealed | implied
                 missed_names += has_true and accepted is None
     counts = false_names, false_opportunities, missed_names, true_opportunities
     return Rates(setting, value, is_present_value, *counts)
