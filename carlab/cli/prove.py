@@ -112,9 +112,9 @@ class Prove:
         self._check_options()
         if self.set == "real":
             return self._real()
-        specs = self._specs()
         if self.simulator != "own":
             return self._study()
+        specs = self._specs()
         if self.calibrate:
             return self._calibrate(Proof(self.out, specs))
         if self.baselines:
@@ -214,12 +214,13 @@ class Prove:
 
     def _specs(self) -> list[CaseSpec]:
         from carlab.benchmark.cases.hard_set import drawn_evenly, hard_set
-        from carlab.benchmark.cases.proof_set import MAX_DEVELOPMENT_SEED, drawn, full_set, short_set
+        from carlab.benchmark.cases.proof_set import MAX_DEVELOPMENT_SEED, MAX_TEST_SEED, drawn, full_set, short_set
 
-        if self.set not in ("full", "short") and self.seed > MAX_DEVELOPMENT_SEED:
+        max_seed = MAX_TEST_SEED if self.set in ("full", "short") else MAX_DEVELOPMENT_SEED
+        if self.seed > max_seed:
             raise ConfigError(
-                f"--seed {self.seed}: --set {self.set} has seeds 0 to {MAX_DEVELOPMENT_SEED}; later ones share cases "
-                "between development and test."
+                f"--seed {self.seed}: --set {self.set} has seeds 0 to {max_seed}; later ones share cases between "
+                "development and test."
             )
         if self.set == "short":
             specs = short_set("test", self.seed)

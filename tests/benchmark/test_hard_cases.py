@@ -13,7 +13,14 @@ import pytest
 from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.cases.conditions import Conditions, with_stamp_delays
 from carlab.benchmark.cases.hard_set import CONDITIONS, drawn_evenly, hard_set, under
-from carlab.benchmark.cases.proof_set import STRENGTHS, CaseSpec, full_set
+from carlab.benchmark.cases.proof_set import (
+    MAX_DEVELOPMENT_SEED,
+    MAX_TEST_SEED,
+    STRENGTHS,
+    CaseSpec,
+    Purpose,
+    full_set,
+)
 from carlab.benchmark.effects.catalogue import EFFECT_IDS, are_confusable
 from carlab.benchmark.proof.runner import Proof
 from carlab.benchmark.world.base_car import BaseCar
@@ -22,6 +29,17 @@ from carlab.core.errors import ConfigError
 
 SHORT = {"fit_s": 8.0, "hold_s": 5.0}
 PERIOD_S = 1.0 / 30.0
+
+
+def test_no_permitted_seed_shares_cases_between_development_and_test() -> None:
+    def seeds(purpose: Purpose, last: int) -> set[int]:
+        sets = [full_set(purpose, seed) for seed in range(last + 1)]
+        sets += [hard_set(purpose, seed) for seed in range(MAX_DEVELOPMENT_SEED + 1)]
+        return {spec.seed for specs in sets for spec in specs}
+
+    assert not seeds("development", MAX_DEVELOPMENT_SEED) & seeds("test", MAX_TEST_SEED)
+    assert seeds("development", MAX_DEVELOPMENT_SEED) & seeds("test", MAX_TEST_SEED + 1)
+    assert seeds("development", MAX_DEVELOPMENT_SEED + 1) & seeds("test", MAX_TEST_SEED)
 
 
 def test_set_has_each_effect_under_each_condition_and_with_each_strength_once() -> None:

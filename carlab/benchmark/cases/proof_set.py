@@ -18,6 +18,8 @@ STRENGTHS = (0.5, 1.0, 2.0, 4.0)
 SEED_BASE = {"development": 1_000_000, "test": 2_000_000}
 MAX_DEVELOPMENT_SEED = 9
 """Largest seed of a set for development, and of a hard set: cases of seed 10 share seeds with the other set."""
+MAX_TEST_SEED = 29
+"""Largest seed of the full and the short set: cases of seed 30 share seeds with the hard set for development."""
 # Faults that leave the concealed effects identifiable.
 FAULTS_OF_SINGLE_CASES = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
 Purpose = Literal["development", "test"]
