@@ -20,6 +20,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # A terminal in Latin-1 cannot show every file name.
             stream.reconfigure(errors="backslashreplace")
+    _ignore_current_folder_in_children()
     try:
         try:
             code = run(sys.argv[1:] if argv is None else argv)
@@ -32,6 +33,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = EXIT_BROKEN_PIPE
     sys.exit(code)
+
+
+def _ignore_current_folder_in_children() -> None:
+    """Let child processes ignore modules in the current folder, such as a random.py, if this process does."""
+    try:
+        ignored = os.getcwd() not in sys.path and "" not in sys.path
+    except FileNotFoundError:  # The current folder was deleted.
+        return
+    if ignored:
+        os.environ["PYTHONSAFEPATH"] = "1"
 
 
 def run(argv: Sequence[str]) -> int:
