@@ -21,9 +21,10 @@ from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.quantities import CarState
 from carlab.experiment.campaign import training
+from carlab.experiment.campaign.child_process import ChildError
 from carlab.experiment.campaign.training import SUCCESS_BONUS, train
 from carlab.experiment.campaign.training_plan import TrainingPlan
-from carlab.experiment.campaign.training_process import train_in_subprocess
+from carlab.experiment.campaign.training_process import TrainingDiedError, train_in_subprocess
 from carlab.prediction.learned import drive_windows, recorded_windows
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -201,3 +202,28 @@ def test_error_in_the_training_process_is_reported_in_one_sentence(
     assert "\n" not in str(error.value)
     assert names(run) == ([] if recording is None else ["episodes/0001.mcap"])
     assert multiprocessing.active_children() == []
+
+
+@pytest.mark.parametrize(
+    ("recordings", "expected"),
+    [
+        ([], "The training process died (exit code 1; -9 often means too little memory). Start the run again."),
+        (
+            [Path("0001.mcap")],
+            "The training process died (exit code 1; -9 often means too little memory); the recordings are kept. "
+            "Resume the run with --resume.",
+        ),
+    ],
+    ids=["before the first episode", "after an episode"],
+)
+def test_death_of_the_training_process_names_the_next_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recordings: list[Path], expected: str
+) -> None:
+    def die(*_: object, **__: object) -> None:
+        raise ChildError("died", "exit code 1")
+
+    monkeypatch.setattr("carlab.experiment.campaign.training_process.run_in_child", die)
+    plan = tiny_plan(choose_car("sim"))
+    with pytest.raises(TrainingDiedError) as error:
+        train_in_subprocess(plan, tmp_path, recordings, ENVELOPE, lambda *what: None)
+    assert str(error.value) == expected

@@ -64,12 +64,13 @@ def train_in_subprocess(
             "training", train, (plan, models, recordings, envelope), stop, on_report=progress
         )
     except ChildError as error:
+        kept = "; the recordings are kept" if recordings else ""
         if error.end == "died":
+            remedy = "Resume the run with --resume." if recordings else "Start the run again."
             raise TrainingDiedError(
-                f"The training process died ({error}; -9 often means too little memory); the recordings are kept. "
-                "Resume the run with --resume."
+                f"The training process died ({error}; -9 often means too little memory){kept}. {remedy}"
             ) from None
-        crash = f"Training failed: {error}; the recordings are kept."
+        crash = f"Training failed: {error}{kept}."
         raise DataError(str(error) if error.end == "failed" else crash) from None
     finally:
         for unfinished in models.glob("*.partial"):
