@@ -122,7 +122,15 @@ def _split(
                 "The held-out recordings have no unbroken stretch of half a second; hold out other recordings."
             )
         return fit_segments, held_out_segments
-    return split_segments(fit_segments, share, settings.held_out_window_s + settings.split_guard_s)
+    early, late = split_segments(fit_segments, share, settings.held_out_window_s + settings.split_guard_s)
+    recorded_s, remaining_s = (sum(segment.duration_s for segment in part) for part in (fit_segments, early))
+    if remaining_s < settings.min_fit_s <= recorded_s:
+        raise Inconclusive(
+            f"The recordings contain {recorded_s:.1f} s of driving, but only {remaining_s:.1f} s without the last part "
+            "of each recording, which is held out, and the gap before it. Hold out whole recordings with --held-out, "
+            "name the folder of a run (every third episode is held out), or record longer drives."
+        )
+    return early, late
 
 
 def _cut(

@@ -24,6 +24,7 @@ def test_load_car_accepts_names_paths_and_cars(tmp_path: Path) -> None:
     assert carlab.load_car(car) is car
     default = carlab.load_car()
     assert carlab.load_car(default.save(tmp_path / "default.toml")).simulator == default.simulator
+    assert repr(default) == "<CarFile rc_car: dynamic>"
     with pytest.raises(ConfigError, match="eth_rc_car"):
         carlab.load_car("no_such_car")
 
@@ -128,6 +129,7 @@ def test_report_is_saved_and_has_notebook_html(lagging: tuple[Path, carlab.Diagn
     assert tomllib.loads(report.model.text)["effects"]["steering_lag"]
     assert report._repr_html_().startswith("<iframe srcdoc=")
     assert "steering" in str(report)
+    assert repr(report) == str(report), "a Python session shows the verdict"
 
 
 def test_verb_writes_the_report_of_the_call(
@@ -149,6 +151,16 @@ def test_short_recording_is_inconclusive_with_a_reason(tmp_path: Path) -> None:
     assert report.verdict == "inconclusive"
     assert "s" in report.sentence
     assert (tmp_path / "out" / "report.json").is_file()
+
+
+def test_recordings_too_short_to_be_split_are_inconclusive_with_a_remedy(tmp_path: Path) -> None:
+    """Of seven drives of 120 rows at 30 Hz, nothing remains before the held-out last part of each and its gap."""
+    drives = [csv_file(tmp_path / f"{k}.csv") for k in range(7)]
+    sentence = carlab.diagnose(drives).sentence
+    assert "contain 28.0 s of driving, but only 0.0 s without the last part of each recording" in sentence
+    assert "Hold out whole recordings with --held-out" in sentence
+    remedied = carlab.diagnose(drives[:5], held_out=drives[5:]).sentence
+    assert "throttle command is constant" in remedied, "the next check, of commands, follows"
 
 
 def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
