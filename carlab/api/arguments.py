@@ -15,7 +15,7 @@ def above_zero(**values: Any) -> None:
     for name, value in values.items():
         is_number = isinstance(value, numbers.Real)
         if value is not None and not (is_number and 0.0 < float(value) < math.inf):
-            text = f"{float(value):g}" if is_number else value
+            text = f"{float(value):g}" if is_number else repr(value)
             raise ConfigError(f"--{name.replace('_', '-')} {text}: give a number above zero.")
 
 
@@ -23,7 +23,7 @@ def whole_number(**values: Any) -> None:
     """Raise ConfigError for an argument that is no integer; None is valid."""
     for name, value in values.items():
         if value is not None and not isinstance(value, numbers.Integral):
-            raise ConfigError(f"--{name.replace('_', '-')} {value}: give a whole number.")
+            raise ConfigError(f"--{name.replace('_', '-')} {value!r}: give a whole number.")
 
 
 def at_least(minimum: int, **values: Any) -> None:

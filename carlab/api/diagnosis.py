@@ -122,7 +122,7 @@ class DiagnosisReport:
         page = html.escape(self.to_html(), quote=True)
         return f'<iframe srcdoc="{page}" style="width:100%;height:720px;border:0"></iframe>'
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """The verdict, and one sentence for each effect."""
         return "\n  ".join([self.sentence, *(effect.sentence for effect in self.diagnosis.effects)])
 

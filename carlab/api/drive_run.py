@@ -51,9 +51,12 @@ class DriveRun:
         return self.episodes[-1].reason if self.episodes else None
 
     def __repr__(self) -> str:
-        """One line: folder, number of episodes, last end."""
-        end = "nothing driven" if self.end is None else self.end.name.lower()
-        return f"<DriveRun {self.folder}: {len(self.episodes)} episodes, {end}>"
+        """Folder, number of episodes, last end and its cause."""
+        if self.end is None:
+            return f"<DriveRun {self.folder}: nothing driven>"
+        count = "1 episode" if len(self.episodes) == 1 else f"{len(self.episodes)} episodes"
+        cause = self.episodes[-1].data.metadata["end_detail"]
+        return f"<DriveRun {self.folder}: {count}, {self.end.name.lower()}{cause and f': {cause}'}>"
 
     def _repr_html_(self) -> str:
         names = figure_names(self.episodes)

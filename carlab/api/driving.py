@@ -236,7 +236,8 @@ def _check(
     valid_seed(seed=seed)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():
         raise ConfigError(
-            f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn."
+            f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn. A "
+            "policy of your own is an object in a Python script: carlab.drive(policy=...), see examples/own_policy.py."
         )
     if not isinstance(policy, (str, Path)):
         _check_object(policy)
@@ -248,6 +249,8 @@ def _check(
 
 def _check_object(policy: Policy) -> None:
     """Raise ConfigError if an object is no policy; the message names what it lacks."""
+    if isinstance(policy, type):
+        raise ConfigError(f"--policy {policy.__name__}: it is a class; give an object of it, {policy.__name__}(...).")
     missing = [f"the method {name}" for name in ("act", "reset") if not callable(getattr(policy, name, None))]
     missing += [] if isinstance(getattr(policy, "name", None), str) else ["the attribute name (a string)"]
     if missing:

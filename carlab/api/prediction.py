@@ -122,7 +122,7 @@ class PredictionErrors:
             written.append(file)
         return written
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """The table as text."""
         head = f"{'error after ' + format(self.horizon_s, '.2f') + ' s':20}"
         lines = [head + "".join(f"{column:>12}" for column in ERROR_COLUMNS)]

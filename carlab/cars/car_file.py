@@ -47,6 +47,10 @@ class CarFile:
     recording_noise: RecordingNoise | None = None
     track: Track | None = None
 
+    def __repr__(self) -> str:
+        """One line: name, kind of vehicle model, and whether the file has ``[hardware]``."""
+        return f"<CarFile {self.name}: {self.simulator.kind}{' with [hardware]' if self.real else ''}>"
+
     def save(self, path: Path | str) -> Path:
         """Write the file as TOML, replacing an existing file; returns the path.
 

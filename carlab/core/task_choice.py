@@ -154,11 +154,14 @@ def _task_of_file(file: str, class_name: str, sha256: str) -> Task:
     except (Exception, SystemExit) as error:
         raise ConfigError(f"--task: {path.name} cannot be loaded: {type(error).__name__}: {error}.") from error
     kind = module.__dict__.get(class_name)
-    if not (isinstance(kind, type) and issubclass(kind, Task)):
+    if not isinstance(kind, type):
         classes = [n for n, v in module.__dict__.items() if isinstance(v, type) and v.__module__ == module.__name__]
         known = f"; it has {', '.join(classes)}" if classes else ""
+        raise ConfigError(f"--task: {path.name} has no class {class_name}{known}.")
+    if not issubclass(kind, Task):
         raise ConfigError(
-            f"--task: {path.name} has no class {class_name} that is derived from carlab.core.task.Task{known}."
+            f"--task: {class_name} in {path.name} is not derived from carlab.core.task.Task; write "
+            f"'class {class_name}(Task):'."
         )
     try:
         return kind()

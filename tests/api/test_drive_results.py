@@ -116,7 +116,27 @@ def test_object_that_is_no_policy_is_refused_with_what_it_lacks(tmp_path: Path) 
         drive(tmp_path, policy=Nameless())
     with pytest.raises(ConfigError, match="this one lacks the method act and the method reset and"):
         drive(tmp_path, policy=3)
+    with pytest.raises(
+        ConfigError, match=r"--policy Failing: it is a class; give an object of it, Failing\(\.\.\.\)\."
+    ):
+        drive(tmp_path, policy=Failing)
     assert not list(tmp_path.iterdir())
+
+
+class Failing:
+    name = "failing"
+
+    def reset(self) -> None: ...
+
+    def act(self, view: object) -> carlab.Action:
+        raise ZeroDivisionError("division by zero")
+
+
+def test_text_of_a_run_names_the_cause_of_its_end(tmp_path: Path) -> None:
+    run = drive(tmp_path, policy=Failing(), picture=False)
+    assert repr(run) == f"<DriveRun {run.folder}: 1 episode, policy_error: ZeroDivisionError: division by zero>"
+    run = drive(tmp_path, picture=False, episodes=2)
+    assert repr(run) == f"<DriveRun {run.folder}: 2 episodes, completed>"
 
 
 @pytest.mark.parametrize("call", [carlab.drive, carlab.learn])

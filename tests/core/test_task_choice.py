@@ -124,8 +124,8 @@ def test_unknown_task_is_refused(name: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("source", "name", "message"),
     [
-        (USER_TASK, "Nothing", "has no class Nothing .* it has Reach, Unfinished, Other"),
-        (USER_TASK, "Other", "has no class Other that is derived from"),
+        (USER_TASK, "Nothing", "has no class Nothing; it has Reach, Unfinished, Other"),
+        (USER_TASK, "Other", "Other in .* is not derived from carlab.core.task.Task; write .class Other.Task.:"),
         (USER_TASK, "Unfinished", "Unfinished.. fails: TypeError: .*reward"),
         ("def", "Reach", "cannot be loaded: SyntaxError"),
         ("import nothing_of_this_name", "Reach", "cannot be loaded: ModuleNotFoundError"),

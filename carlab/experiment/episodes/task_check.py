@@ -209,7 +209,8 @@ def _values(task: Task, name: str, result: Any, shape: tuple[int, ...], bool_wan
     """A result of a function of features as an array of the wanted shape and kind."""
     array: np.ndarray = _call(task, f"the value of {name} as an array", np.asarray, result)
     if array.shape != shape:
-        raise _error(task, f"{name} returns the shape {array.shape} for features of shape {(*shape, 'F')}; "
+        features = ", ".join(map(str, (*shape, "F")))
+        raise _error(task, f"{name} returns the shape {array.shape} for features of shape ({features}); "
                            f"return one value per row, {shape}")  # fmt: skip
     kind = "b" if bool_wanted else "fiu"
     if array.dtype.kind not in kind:
