@@ -77,8 +77,9 @@ class SafetyEnvelope:
         for name in (f.name for f in fields(self) if f.name not in ("reaction_s", "arena_m")):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be above zero, not {getattr(self, name)}.")
-        if not (0 < self.max_steering <= 1 and 0 < self.max_throttle <= 1):
-            raise ConfigError("max_steering and max_throttle must lie in (0, 1].")
+        for name in ("max_steering", "max_throttle"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"{name} is {getattr(self, name):g}; it must lie in (0, 1].")
         if self.lost_pose_s < self.stale_pose_s:
             raise ConfigError("lost_pose_s must not be shorter than stale_pose_s.")
 

@@ -33,7 +33,7 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """Build dataclass ``cls`` from a TOML table. Nested dataclasses take nested tables; lists become tuples.
 
     ``where`` names the table in messages, for example ``[mocap] of car.toml``. Raises ConfigError for an unknown
-    key, a missing one, a value of the wrong type or NaN.
+    key, a missing one, a value of the wrong type or NaN, and what ``cls`` refuses.
     """
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where} must be a table, not {table!r}.")
@@ -46,7 +46,10 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
             values[name] = _convert(hints[name], table[name], f"'{name}' in {where}")
         elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
             raise ConfigError(f"'{name}' is missing in {where}; add it.")
-    return cls(**values)
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def number(value: Any, where: str) -> float:

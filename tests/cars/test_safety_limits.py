@@ -70,3 +70,22 @@ def test_limits_up_to_their_bounds_are_accepted(tmp_path: Path) -> None:
     real = load_car_file(car_file(tmp_path, "hardware", *arming)).real
     assert real is not None
     assert (real.hardware.arm_max_speed_mps, real.hardware.arm_max_pose_age_s) == (0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("table", "line", "message"),
+    [
+        ("hardware.limits", "max_throttle = 40", "max_throttle is 40; it must lie in (0, 1]."),
+        ("hardware.calibration", "max_current_a = 0", "max_current_a is 0; it must be positive."),
+        (
+            "hardware.actuator",
+            'kind = "vesc_seriel"',
+            "kind of the actuator is 'vesc_seriel'; it must be one of vesc_serial, vesc_can.",
+        ),
+    ],
+)
+def test_message_about_a_value_names_its_table_and_file(tmp_path: Path, table: str, line: str, message: str) -> None:
+    path = car_file(tmp_path, table, line)
+    with pytest.raises(ConfigError) as error:
+        load_car_file(path)
+    assert str(error.value) == f"[{table}] of {path}: {message}"
