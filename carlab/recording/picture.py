@@ -106,8 +106,9 @@ def _draw_arena_path_and_goal(plan: Any, episodes: Sequence[EpisodeData]) -> Non
         plan.plot(*closed.T, color=_TEXT_COLOUR, linewidth=1.6, label="arena", zorder=1)
     if len(path):
         plan.plot(*path.T, color=_LIGHT_GREY, linewidth=4, solid_capstyle="round", label="path", zorder=1)
-    for line in next((found for e in episodes if (found := outlines_of(e.metadata))), []):
-        plan.plot(*np.vstack([line, line[:1]]).T, color="#D55E00", linewidth=1.4, zorder=1)
+    for k, line in enumerate(next((found for e in episodes if (found := outlines_of(e.metadata))), [])):
+        label = "limit" if k == 0 else None
+        plan.plot(*np.vstack([line, line[:1]]).T, color="#D55E00", linewidth=1.4, label=label, zorder=1)
     if goal is not None:
         shape = outline(*goal)
         plan.fill(*shape.T, facecolor="#009E73", alpha=0.25, zorder=2)

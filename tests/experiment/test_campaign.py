@@ -190,6 +190,14 @@ def test_picture_has_one_axis_a_panel_and_no_cut_text(
         assert box.x0 >= 0, text.get_text()
         assert box.x1 <= figure.bbox.width, text.get_text()
     assert figure._suptitle.get_text().replace("\n", " ").strip() == row.diagnosis.strip()
+    (plan,) = (axis for axis in figure.axes if axis.get_xlabel() == "x [m]")
+    labels = [text.get_text() for text in plan.get_legend().get_texts()]
+    assert sorted(labels) == ["arena", "driven", "end", "goal"], "the episode is too short for predictions"
+    (goal,) = (line.get_xydata() for line in plan.get_lines() if line.get_label() == "goal")
+    assert goal[:, 0].max() == pytest.approx(0.21), (
+        "the nose of a car at the goal, with heading 0, is at half its length"
+    )
+    assert np.abs(goal[np.argmax(goal[:, 0]), 1]) < 1e-12, "the outline has a pointed front"
 
 
 def test_likelihood_uses_the_model_trained_before_the_episode(interrupted: InterruptedRun) -> None:

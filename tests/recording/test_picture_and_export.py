@@ -44,6 +44,14 @@ def test_picture_shows_the_goal_only_if_the_metadata_has_one(tmp_path, episode):
     assert not (np.abs(plan - np.array([0, 158, 115]) / 255) < 0.02).all(axis=2).sum() > 100
 
 
+def test_legend_has_the_limits_of_a_task(tmp_path, episode):
+    discs = json.dumps([[[0.0, 0.0], [0.1, 0.0], [0.1, 0.1]], [[1.0, 0.0], [1.1, 0.0], [1.1, 0.1]]])
+    limited = dataclasses.replace(episode, metadata={**episode.metadata, "outlines_m": discs})
+    for data, count in ((episode, 0), (limited, 1)):
+        save_summary([data], tmp_path / "drive.svg")
+        assert (tmp_path / "drive.svg").read_text().count("<!-- limit -->") == count
+
+
 @pytest.mark.parametrize("count", [2, 12])
 def test_picture_of_several_episodes_accepts_missing_data(tmp_path, episode, count):
     incomplete = dataclasses.replace(

@@ -16,8 +16,8 @@ from carlab.core.observation import episode_features
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS
 from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, WindowPredictions
+from carlab.recording.picture import outline
 
-CAR_M = (0.3, 0.16)
 CHARACTERS_PER_LINE = 210
 
 
@@ -119,19 +119,23 @@ def _legend_below(axis: Any) -> None:
 
 
 def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task: Task) -> None:
-    from matplotlib.patches import Ellipse, Polygon
+    from matplotlib.patches import Ellipse
 
     axis.plot(*episode.states[:, :2].T, color="black", linewidth=1.5, label="driven")
     for k, (mean, std) in enumerate(zip(predictions.mean, predictions.std, strict=True)):
         axis.plot(mean[:, 0], mean[:, 1], color="tab:orange", linewidth=1.2, label="predicted" if k == 0 else None)
         width, height = 4.0 * std[-1, :2]
-        axis.add_patch(Ellipse((mean[-1, 0], mean[-1, 1]), width, height, alpha=0.25, color="tab:orange", linewidth=0))
+        ellipse = Ellipse((mean[-1, 0], mean[-1, 1]), width, height, alpha=0.25, color="tab:orange", linewidth=0)
+        ellipse.set_label("2 standard deviations" if k == 0 else "")
+        axis.add_patch(ellipse)
     for name, pose, colour in (("goal", task.goal, "tab:green"), ("end", tuple(episode.states[-1, :3]), "tab:blue")):
         if pose is not None:
-            axis.add_patch(Polygon(_outline(pose), fill=False, edgecolor=colour, linewidth=2))
-            axis.plot([], [], color=colour, label=name)
-    for outline in (*([task.arena_m] if task.arena_m else []), *task.outlines_m):
-        axis.plot(*np.array([*outline, outline[0]]).T, color="tab:red", linewidth=0.8, alpha=0.5)
+            axis.plot(*outline(*pose).T, color=colour, linewidth=2, label=name)
+    limits = {"arena": [task.arena_m] if task.arena_m else [], "limit": task.outlines_m}
+    for (name, lines), colour in zip(limits.items(), ("black", "tab:red"), strict=True):
+        for k, line in enumerate(lines):
+            label = name if k == 0 else None
+            axis.plot(*np.array([*line, line[0]]).T, color=colour, linewidth=0.8, alpha=0.5, label=label)
     if task.has_constraint:
         features = episode_features(episode.states, episode.sent, task.history_length)[1:]
         violating = episode.states[1:][np.asarray(task.cost(features)) > 0.0]
@@ -156,14 +160,6 @@ def _state(axis: Any, which: int, episode: EpisodeData, predictions: WindowPredi
     axis.set_xlabel("t [s]", fontsize=8)
     axis.tick_params(labelsize=7)
     axis.grid(alpha=0.3)
-
-
-def _outline(pose: Sequence[float]) -> np.ndarray:
-    half = 0.5 * np.array(CAR_M)
-    corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half
-    sin, cos = np.sin(pose[2]), np.cos(pose[2])
-    outline: np.ndarray = corners @ np.array([[cos, sin], [-sin, cos]]) + np.array(pose[:2])
-    return outline
 
 
 __all__ = ["draw"]
