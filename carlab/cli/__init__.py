@@ -101,7 +101,10 @@ def _where_options_belong(verb: str, error: Exception) -> str:
     return f" Convert the file with carlab import and this option first, then {verb} the .mcap file."
 
 
-_DESCRIPTION = "Drive, learn and diagnose small race cars: real cars, cars with emulated hardware, and simulated cars."
+_DESCRIPTION = (
+    "Drive, learn and diagnose small race cars: real cars, cars with emulated hardware, and simulated cars. "
+    "carlab --version prints the version."
+)
 
 
 def _verbs() -> dict[str, Callable[..., Any]]:

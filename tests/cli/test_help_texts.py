@@ -1,5 +1,6 @@
 """Test that help texts are wrapped at the width of the terminal, and that they print no empty defaults."""
 
+import inspect
 import itertools
 import os
 import subprocess
@@ -30,6 +31,20 @@ def test_each_line_of_a_help_text_is_full(verb: str) -> None:
     ]
     assert len(continued) > 20
     assert [row for row, word in continued if len(f"{row.rstrip()} {word}") <= WIDTH - 4] == []
+
+
+@pytest.mark.parametrize("verb", _verbs())
+def test_no_line_of_a_description_begins_with_a_hyphen(verb: str) -> None:
+    """tyro joins the lines of a paragraph, but it begins a new line at a hyphen, as at an item of a list."""
+    description = inspect.getdoc(_verbs()[verb]) or ""
+    assert description
+    assert [line for line in description.split("\n") if line.startswith("-")] == []
+
+
+def test_help_names_the_option_that_prints_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        run(["--help"])
+    assert "carlab --version" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("verb", _verbs())
