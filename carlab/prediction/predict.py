@@ -32,6 +32,9 @@ from sim_backends.measurement import velocity_curvature as state_curvature
 
 MAX_STEP_S = 0.017
 """Maximum integration step: at 30 Hz its error is below a hundredth of a noise floor."""
+MAX_SINGLE_POSE = 100.0
+"""Maximum coordinate of a pose [m, rad] that is simulated with 32 bits; each step rounds it by at most 4e-6. Surveyed
+coordinates of 5e6 m would be rounded to 0.5 m."""
 
 
 class PredictiveModel(Protocol):
@@ -116,7 +119,8 @@ def simulate_windows(
             ``config``.
         max_step_s: maximum integration step.
         ticks: indices (U,) of the ticks to return; all K + 1 by default.
-        in_double: simulate with 64 instead of 32 bits, which takes twice as long.
+        in_double: simulate with 64 instead of 32 bits, which takes twice as long. Poses farther from the origin than
+            ``MAX_SINGLE_POSE`` always have 64 bits.
         engine: of the rollouts.
 
     Returns:
@@ -134,9 +138,10 @@ def simulate_windows(
     inner[COMMAND_DELAY] = np.asarray(delay_s)
     unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, parameter_std={})
     count = len(windows)
+    is_far = bool((np.abs(windows.initial_states[:, :3]) > MAX_SINGLE_POSE).any())
 
     def tensor(array: FloatArray) -> torch.Tensor:
-        return torch.from_numpy(np.array(array, dtype=np.float64 if in_double else np.float32))
+        return torch.from_numpy(np.array(array, dtype=np.float64 if in_double or is_far else np.float32))
 
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
     start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]

@@ -139,6 +139,15 @@ def test_error_of_a_wrong_parameter_equals_scipy(even):
     assert [row.channel for row in channel_errors(found)] == ["x", "y", "yaw", "vx", "vy", "yaw_rate"]
 
 
+def test_prediction_does_not_depend_on_the_origin_of_the_coordinates(even):
+    """Surveyed coordinates are millions of metres from their origin; 32 bits round them to half a metre."""
+    windows = recorded_windows(even, 1.0, 1.7)
+    offset = np.array([6.5e6, -4.2e6, 0.0, 0.0, 0.0, 0.0])
+    far = replace(windows, initial_states=windows.initial_states + offset, measured=windows.measured + offset)
+    near_errors, far_errors = (final_errors(SimulatorModel(CONFIG), w) for w in (windows, far))
+    np.testing.assert_allclose(far_errors, near_errors, atol=1e-4)
+
+
 def test_commands_before_a_window_act_through_the_delay(even):
     """Without the delay the same recording has a much larger error."""
     windows = recorded_windows(even)
