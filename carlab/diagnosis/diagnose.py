@@ -141,16 +141,17 @@ def diagnose(
     stages = curves, ceiling, discrepancy, adapt, keep_events
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
-    control = RunControl(progress, stop, decisions.append, timer.ends_search, workers or FunctionWorkers())
+    control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, workers or FunctionWorkers())
     recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
     scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
-    return _with_run(outcome, timer, decisions)
+    return _with_run(outcome, timer, effects or (), decisions)
 
 
-def _with_run(outcome: Outcome, timer: SearchTimer, decisions: Sequence[Decision]) -> Outcome:
-    """The outcome with time, extent and decisions of the search."""
-    diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
+def _with_run(outcome: Outcome, timer: SearchTimer, effects: Sequence[str], decisions: Sequence[Decision]) -> Outcome:
+    """The outcome with run time, and extent and decisions of the search, restricted to ``effects`` if there are any."""
+    extent = replace(timer.extent(), effects=tuple(effects))
+    diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent)
     return replace(outcome, diagnosis=diagnosis, figure_data=replace(outcome.figure_data, decisions=tuple(decisions)))
 
 
@@ -299,10 +300,14 @@ def _measured_curves(
 ) -> CurveFit | None:
     """Measured curves if they are wanted, and named effects leave a residual that a curve may explain."""
     settings = request.settings.curves
-    if not request.curves or unexplained < settings.min_unexplained_share or control.stop():
+    if not request.curves or unexplained < settings.min_unexplained_share:
         return None
-    found = fit_curves(scored.problem, scored.found, control)
-    return None if found is None else without_extrapolation(found, recordings.fit_segments, settings)
+    found = None if control.stop() else fit_curves(scored.problem, scored.found, control)
+    if found is None:
+        if control.stop():
+            control.omit("measured curves")
+        return None
+    return without_extrapolation(found, recordings.fit_segments, settings)
 
 
 def _models(
@@ -313,7 +318,10 @@ def _models(
     request: Request,
     control: RunControl,
 ) -> dict[str, PredictiveModel]:
-    """All models whose held-out errors are reported; networks are trained on the recordings to fit."""
+    """All models whose held-out errors are reported; networks are trained on the recordings to fit.
+
+    A network whose training the user ended is omitted: its error says nothing about what can be predicted.
+    """
     found = scored.found
     models: dict[str, PredictiveModel] = {
         "nominal": SimulatorModel(scored.problem.nominal),
@@ -323,8 +331,15 @@ def _models(
     if measured is not None:
         models["with_curves"] = SimulatorModel(measured.fit.config)
 
-    def trained(simulator: PredictiveModel | None) -> PredictiveModel:
-        return train_ensemble(
+    diagnosed = models.get("with_curves", models["with_effects"])
+    networks = (
+        ("with_discrepancy", "learned discrepancy", request.discrepancy, diagnosed),
+        ("black_box", "black box", request.ceiling, None),
+    )
+    for key, name, is_requested, simulator in networks:
+        if not is_requested:
+            continue
+        trained = train_ensemble(
             recordings.fit_segments,
             simulator=simulator,
             seed=request.seed,
@@ -332,11 +347,10 @@ def _models(
             progress=control.progress,
             stop=control.stop,
         )
-
-    if request.discrepancy:
-        models["with_discrepancy"] = trained(models.get("with_curves", models["with_effects"]))
-    if request.ceiling:
-        models["black_box"] = trained(None)
+        if control.stop():
+            control.omit(name)
+        else:
+            models[key] = trained
     if adaptation is not None:
         models["adapted"] = adaptation.model
     return models | {"constant_velocity": ConstantVelocity()}
@@ -350,7 +364,10 @@ def _adaptation(
     control: RunControl,
 ) -> Adaptation | None:
     """The corrected simulator adapted along the held-out recordings, if it is wanted."""
-    if not request.adapt or control.stop():
+    if not request.adapt:
+        return None
+    if control.stop():
+        control.omit("adaptation")
         return None
     control.progress("adapting along the held-out recordings", 0.93)
     config = scored.found.best.config if measured is None else measured.fit.config

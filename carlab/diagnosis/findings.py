@@ -231,11 +231,20 @@ class SearchExtent:
         is_complete: whether it ended by itself.
         stopped_by: "budget" or "user" if it was cut short; else empty.
         budget_s: time limit [s]; None without one.
+        effects: effects that the search was restricted to; empty for the whole catalogue.
+        omitted: requested stages after the search that the user ended: the report lacks their results.
     """
 
     is_complete: bool = True
     stopped_by: str = ""
     budget_s: float | None = None
+    effects: tuple[str, ...] = ()
+    omitted: tuple[str, ...] = ()
+
+    @property
+    def covers_catalogue(self) -> bool:
+        """Whether all effects of the catalogue were searched."""
+        return self.is_complete and not self.effects
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Time limit of the search for effects."""
+"""Time limit of the search for effects, and what the end of a diagnosis omitted."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ class SearchTimer:
         self._began_s = self._clock.now_s()
         self._end_s = None if budget_s is None else self._began_s + search_share * budget_s
         self._stopped_by = ""
+        self._omitted: list[str] = []
 
     def ends_search(self) -> bool:
         """Whether the search must end. The search calls this only while it has more to do."""
@@ -48,6 +49,10 @@ class SearchTimer:
             elif self._end_s is not None and self._clock.now_s() >= self._end_s:
                 self._stopped_by = "budget"
         return bool(self._stopped_by)
+
+    def omit(self, stage: str) -> None:
+        """Remember that the user ended a requested stage without a result."""
+        self._omitted.append(stage)
 
     def progress(self, shown: Callable[[str, float], None]) -> Callable[[str, float], None]:
         """The progress callback ``shown`` with the remaining time of the search behind the activity."""
@@ -63,9 +68,9 @@ class SearchTimer:
         return self._clock.now_s() - self._began_s
 
     def extent(self) -> SearchExtent:
-        """Whether the search was complete, and what ended it."""
+        """Whether the search was complete, what ended it, and the stages without a result."""
         limit_s = None if self.budget_s == math.inf else self.budget_s
-        return SearchExtent(not self._stopped_by, self._stopped_by, limit_s)
+        return SearchExtent(not self._stopped_by, self._stopped_by, limit_s, omitted=tuple(self._omitted))
 
 
 __all__ = ["SearchTimer"]

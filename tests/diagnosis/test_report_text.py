@@ -291,6 +291,33 @@ def test_search_that_was_cut_short_has_not_excluded_the_catalogue() -> None:
     assert next_drive(cut) == ("", "Diagnose these recordings again with a longer time limit, before another drive.")
 
 
+def test_restricted_search_has_not_excluded_the_catalogue() -> None:
+    """A car with a lag of the servo, diagnosed with --effects aerodynamic_drag, lacks physics of the catalogue."""
+    unexplained = Unexplained(0.7, ("yaw",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
+    whole = replace(diagnosis("unexplained"), unexplained=unexplained)
+    restricted = replace(whole, search=SearchExtent(effects=("aerodynamic_drag", "motor_lag")))
+    sentence = verdict_sentence(restricted)
+    assert "no effect of the catalogue" not in sentence
+    assert "The search was restricted to these effects: aerodynamic_drag and motor_lag." in sentence
+    assert verdict_title(restricted) != verdict_title(whole) == "Physics outside the catalogue is missing"
+    assert verdict_title(replace(whole, search=SearchExtent(False, "user"))) == verdict_title(restricted)
+    assert next_drive(restricted) == ("", "Diagnose these recordings again without --effects, before another drive.")
+
+
+def test_stages_that_the_user_ended_are_named() -> None:
+    ended = replace(diagnosis("none"), search=SearchExtent(omitted=("measured curves", "black box")))
+    assert verdict_sentence(ended).endswith("so this report has no measured curves and no black box.")
+    assert "The user" not in verdict_sentence(diagnosis("none"))
+
+
+def test_each_sentence_about_the_residual_begins_with_a_capital_letter() -> None:
+    """A share of 99.8 % is "more than 99 %", which does not begin with a number."""
+    rest = Unexplained(0.998, ("yaw",), "everywhere alike", "", "")
+    sentence = verdict_sentence(replace(diagnosis("mismatch", finding("yaw_damping")), unexplained=rest))
+    assert "more than 99 %" in sentence
+    assert not re.search(r"\. [a-z]", sentence)
+
+
 def test_terms_of_a_class_are_numbered() -> None:
     terms = [ChosenTerm(term, channel, 1.0, 1.0) for term, channel in zip(TERMS[:2], (0, 1), strict=True)]
     one, two = (f"{c.term.statement}; acts on {name}" for c, name in zip(terms, ("vx", "vy"), strict=True))

@@ -154,7 +154,22 @@ def test_time_limit_ends_the_search_with_a_valid_report(drag: Case, tmp_path: Pa
     held_out = outcome.diagnosis.held_out
     assert held_out["refit"].score < held_out["nominal"].score
     assert "cut short by the time limit of 0.001 s" in completed(outcome.diagnosis).sentence
-    assert outcome.diagnosis.to_dict()["search"] == {"is_complete": False, "stopped_by": "budget", "budget_s": 1e-3}
+    extent = {"is_complete": False, "stopped_by": "budget", "budget_s": 1e-3, "effects": [], "omitted": []}
+    assert outcome.diagnosis.to_dict()["search"] == extent
+
+
+def test_stages_that_the_user_ends_are_listed_and_give_no_result(
+    drag: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error of an untrained network would state that nothing can be predicted."""
+    for module in ("carlab.diagnosis.diagnose", "carlab.prediction.network_ensemble"):
+        monkeypatch.setattr(f"{module}.check_duration", lambda segments, settings: None)
+    stages = {"curves": True, "ceiling": True, "discrepancy": True, "adapt": True}
+    ended = found(drag, tmp_path, effects=[DRAG], stop=lambda: True, **stages).diagnosis
+    assert ended.search.omitted == ("measured curves", "adaptation", "learned discrepancy", "black box")
+    assert ended.search.effects == (DRAG,)
+    assert set(ended.held_out) == {"nominal", "refit", "with_effects", "constant_velocity", "noise_floor"}
+    assert ended.ceiling is None
 
 
 def test_stopped_search_keeps_the_effects_found_so_far(drag: Case, tmp_path: Path) -> None:

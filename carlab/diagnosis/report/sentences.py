@@ -17,6 +17,7 @@ from carlab.diagnosis.report.numbers import number as number
 from carlab.diagnosis.report.numbers import percent as percent
 from carlab.diagnosis.report.numbers import unit_text as unit_text
 from carlab.diagnosis.report.numbers import with_unit as with_unit
+from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
 from sim_backends.registry import REGISTRY
@@ -171,6 +172,8 @@ def verdict_title(diagnosis: Diagnosis) -> str:
         return "Missing physics is found, with more than one possible name"
     if diagnosis.effects and all(effect.car_file_values for effect in diagnosis.effects):
         return "Effects of the car file have wrong numbers"
+    if diagnosis.verdict == "unexplained" and not diagnosis.search.covers_catalogue:
+        return "Missing physics is found, but not named"
     return VERDICT_TITLES[diagnosis.verdict]
 
 
@@ -201,21 +204,8 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    tails = _with_curves(diagnosis), _with_drift(diagnosis), _with_search(diagnosis)
+    tails = _with_curves(diagnosis), _with_drift(diagnosis), search_sentences(diagnosis.search)
     return f"{worse_than_constant_velocity(diagnosis)}{sentence_of_verdict(diagnosis)}{''.join(tails)}"
-
-
-def _with_search(diagnosis: Diagnosis) -> str:
-    """That the search was cut short, and the remedy; empty after a complete search."""
-    if diagnosis.search.is_complete:
-        return ""
-    limit_s = diagnosis.search.budget_s
-    if diagnosis.search.stopped_by == "budget" and limit_s is not None:
-        why = f"was cut short by the time limit of {with_unit(limit_s, 's')}"
-        remedy = "With --budget inf (Python: budget_s=math.inf) it runs to its end."
-    else:
-        why, remedy = "was stopped by the user", "Diagnose again for a complete search."
-    return f" The search for effects {why}, so it may have missed some. {remedy}"
 
 
 def _with_drift(diagnosis: Diagnosis) -> str:
@@ -285,7 +275,7 @@ def _mismatch(diagnosis: Diagnosis) -> str:
         named = "corrected numbers" if effects and all(e.car_file_values for e in effects) else named
         text += f" With {named}, {fall}{known if math.isfinite(share) else ''}."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
-        text += f" {percent(diagnosis.unexplained.share)} of this excess stays unexplained."
+        text += f" Of this excess, {percent(diagnosis.unexplained.share)} stays unexplained."
     return text
 
 
@@ -338,6 +328,8 @@ def _data(diagnosis: Diagnosis) -> str:
 def _unexplained(diagnosis: Diagnosis) -> str:
     rest = diagnosis.unexplained
     text = "The simulator lacks physics that no effect of the catalogue explains"
+    if diagnosis.search.effects:
+        text = "The simulator lacks physics that none of the searched effects explains"
     if not diagnosis.search.is_complete:
         text = "The search for effects did not finish, and it has not found what the simulator lacks"
     if rest is None:
@@ -378,8 +370,9 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
         drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
         own = advice if advice != diagnosis.sentence else ""
         return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
-    if diagnosis.verdict == "unexplained" and not diagnosis.search.is_complete:
-        return "", "Diagnose these recordings again with a longer time limit, before another drive."
+    if diagnosis.verdict == "unexplained" and not diagnosis.search.covers_catalogue:
+        how = "without --effects" if diagnosis.search.effects else "with a longer time limit"
+        return "", f"Diagnose these recordings again {how}, before another drive."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
         channels = diagnosis.unexplained.channels
         along = bool(channels) and channels[0] in ("x", "vx")

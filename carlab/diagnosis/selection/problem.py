@@ -183,6 +183,7 @@ class RunControl:
     progress    called with the activity and the completed share in [0, 1]
     stop        called between fits; if it returns true, a stage ends with its present result
     record      called with each decision about an effect
+    omit        called with the name of a requested stage that ``stop`` ended without a result
     ends_search called between fits of the search; if it returns true, no further effect is added, but all checks of the
                 accepted effects follow
     workers     processes that share independent fits
@@ -191,6 +192,7 @@ class RunControl:
     progress: Callable[[str, float], None] = lambda activity, share: None
     stop: Callable[[], bool] = lambda: False
     record: Callable[[Decision], None] = lambda decision: None
+    omit: Callable[[str], None] = lambda stage: None
     ends_search: Callable[[], bool] = lambda: False
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
 
