@@ -33,8 +33,8 @@ class SteeringDelay(DelayEffect):
 
     id = "steering_delay"
     name = "a delay of the steering"
-    summary = "The steering command acts later than the throttle command."
-    sentence = "the steering command acts {delay} later than the throttle command"
+    summary = "The steering command has a delay in addition to that of the car file."
+    sentence = "the steering command has an additional delay of {delay}"
     refuted_if = (
         "the wheels start to move at once but reach their angle late, or fast steering has a weaker response than slow"
     )
@@ -59,8 +59,8 @@ class ThrottleDelay(DelayEffect):
     id = "throttle_delay"
     command = "throttle"
     name = "a delay of the throttle"
-    summary = "The throttle command acts later than the steering command."
-    sentence = "the throttle command acts {delay} later than the steering command"
+    summary = "The throttle command has a delay in addition to that of the car file."
+    sentence = "the throttle command has an additional delay of {delay}"
     refuted_if = "the car accelerates at once after a step of throttle, but less at first"
     lag_parameter = "delay"
     parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03, is_delay=True),)

@@ -8,6 +8,7 @@ import pytest
 
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import (
+    Ceiling,
     DataFault,
     Diagnosis,
     EffectFinding,
@@ -19,7 +20,7 @@ from carlab.diagnosis.findings import (
     Skill,
     Unexplained,
 )
-from carlab.diagnosis.report.curves import curves_advice
+from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
 from carlab.diagnosis.report.sentences import (
     confidence_text,
     drive_command,
@@ -179,6 +180,8 @@ def test_first_sentence_states_where_constant_velocity_is_better_and_why() -> No
     assert verdict_sentence(replace(fitted, skill=(better, worse))).startswith(expected)
     wrong = replace(worse, constant_velocity_m=0.12)
     assert "The model is wrong there." in verdict_sentence(replace(fitted, skill=(wrong,)))
+    larger_rms = replace(worse, constant_velocity_m=0.2)  # a smaller mean error, with a few large ones
+    assert verdict_sentence(replace(fitted, skill=(larger_rms,))) == verdict_sentence(fitted)
 
 
 @pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])
@@ -302,6 +305,26 @@ def test_restricted_search_has_not_excluded_the_catalogue() -> None:
     assert verdict_title(restricted) != verdict_title(whole) == "Physics outside the catalogue is missing"
     assert verdict_title(replace(whole, search=SearchExtent(False, "user"))) == verdict_title(restricted)
     assert next_drive(restricted) == ("", "Diagnose these recordings again without --effects, before another drive.")
+
+
+def test_delays_of_both_commands_do_not_contradict_each_other() -> None:
+    """Each is additional to the delay of the car file; neither command is later than the other by its number."""
+    for effect_id in ("steering_delay", "throttle_delay"):
+        sentence = effect_sentence(effect_id, {"delay": around(0.06, "s")})
+        assert "has an additional delay of 0.06 s" in sentence
+        assert "later than" not in sentence
+
+
+def test_ceiling_without_a_predictable_part_states_no_share_of_it() -> None:
+    nothing, half = Ceiling(0.0, 0.0, 1.0), Ceiling(0.3, 0.3, 0.4)
+    assert ceiling_sentence(replace(diagnosis("mismatch"), ceiling=nothing)).endswith("predicts the other 100 %.")
+    assert ceiling_sentence(replace(diagnosis("mismatch"), ceiling=half)).endswith("50 % of the predictable part.")
+
+
+def test_verdict_none_does_not_deny_that_the_refit_has_a_smaller_error() -> None:
+    """The score of the refit may be smaller by an amount that the fitted recordings do not confirm."""
+    sentence = verdict_sentence(diagnosis("none", refit=5.0))
+    assert "improves the prediction significantly" in sentence
 
 
 def test_stages_that_the_user_ended_are_named() -> None:

@@ -46,12 +46,14 @@ def ceiling_sentence(diagnosis: Diagnosis) -> str:
     ceiling = diagnosis.ceiling
     if ceiling is None:
         return ""
-    return (
+    shares = (
         f"The model explains {percent(ceiling.by_model)} of the refit's squared excess over the noise floor. Networks "
         f"predict another {percent(ceiling.predictable)} from past commands and velocities. Neither predicts the "
-        f"other {percent(ceiling.unpredictable)}. The model explains {percent(ceiling.explained_of_predictable)} of "
-        "the predictable part."
+        f"other {percent(ceiling.unpredictable)}."
     )
+    if ceiling.by_model + ceiling.predictable <= 0.0:
+        return shares
+    return f"{shares} The model explains {percent(ceiling.explained_of_predictable)} of the predictable part."
 
 
 def _largest_difference(curve: CurveFinding) -> str:

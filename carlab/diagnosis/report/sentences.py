@@ -226,7 +226,8 @@ def _with_curves(diagnosis: Diagnosis) -> str:
 def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
     """Where constant velocity predicts held-out recordings better than the model, and why; empty if nowhere."""
     settings = DEFAULT.evidence
-    worse = [s for s in diagnosis.skill if s.standard_errors < -settings.skill_z_min]
+    significant = [s for s in diagnosis.skill if s.standard_errors < -settings.skill_z_min]
+    worse = [s for s in significant if s.model_m > s.constant_velocity_m]  # the mean and the rms may disagree
     if not worse:
         return ""
     whole = [s for s in worse if s.regime == "all"]
@@ -309,7 +310,7 @@ def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
 
 def _none(diagnosis: Diagnosis) -> str:
     held = diagnosis.held_out.get("nominal")
-    text = "No missing physics is found. Neither other parameters nor an effect improves the prediction."
+    text = "No missing physics is found. Neither other parameters nor an effect improves the prediction significantly."
     if held is None:
         return text
     return (
