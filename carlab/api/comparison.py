@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.api.cars import load_car
-from carlab.api.loaded_recordings import RecordingLike, as_list, recordings_of_runs
+from carlab.api.loaded_recordings import RecordingLike, as_list, check_contents, recordings_of_runs
 from carlab.api.loaded_recordings import load_recordings as read
 from carlab.core.errors import ConfigError, DataError
 
@@ -63,6 +63,7 @@ def compare(
             raise ConfigError(f"'{name}' cannot change in this car; {nearest_name(name, known)}")
     latency_s = file.simulator.latency_s()
     groups = [read(items, role, latency_s) for items, role in ((first, "first group"), (second, "second group"))]
+    check_contents([use for group in groups for use in group.uses])
     found = search(
         groups[0].episodes,
         groups[1].episodes,

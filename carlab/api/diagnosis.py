@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import at_least, valid_seed
 from carlab.api.cars import load_car
-from carlab.api.loaded_recordings import LoadedRecordings, RecordingLike, as_list, assigned, load_recordings
+from carlab.api.loaded_recordings import (
+    LoadedRecordings,
+    RecordingLike,
+    as_list,
+    assigned,
+    check_contents,
+    load_recordings,
+)
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -197,7 +204,9 @@ def _read_recordings(
     to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
     _check_share(holdout_share, to_validate)
     latency_s = car.simulator.latency_s()
-    return load_recordings(to_fit, "fit", latency_s), load_recordings(to_validate, "held out", latency_s)
+    fit, validation = load_recordings(to_fit, "fit", latency_s), load_recordings(to_validate, "held out", latency_s)
+    check_contents([*fit.uses, *validation.uses])
+    return fit, validation
 
 
 def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorkers:

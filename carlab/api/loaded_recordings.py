@@ -90,6 +90,17 @@ def _check_repetition(items: Iterable[RecordingLike]) -> None:
         known |= {path.resolve()} if path is not None else set()
 
 
+def check_contents(uses: Iterable[RecordingUse]) -> None:
+    """Raise ConfigError if two recordings have the same content: a copy of a fitted recording is not held out."""
+    from carlab.core.errors import ConfigError
+
+    known: dict[str, str] = {}
+    for use in uses:
+        if use.sha256 in known:
+            raise ConfigError(f"{use.path} has the content of {known[use.sha256]}; name one of them.")
+        known[use.sha256] = use.path
+
+
 def _paths_of(items: Iterable[RecordingLike]) -> set[Path]:
     return {path.resolve() for item in items if (path := _path_of(item))}
 

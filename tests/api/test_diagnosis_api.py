@@ -121,7 +121,8 @@ def test_diagnosis_names_the_lag_and_returns_a_loadable_model(
 
 def test_report_is_saved_and_has_notebook_html(lagging: tuple[Path, carlab.DiagnosisReport], tmp_path: Path) -> None:
     report = lagging[1]
-    folder = report.save(tmp_path / "out")
+    report.save_decisions(report.save(tmp_path / "out"))
+    folder = report.save(tmp_path / "out")  # decisions of the earlier report would not belong to this one
     names = {path.name for path in folder.iterdir()}
     assert names == {"report.html", "report.json", "report.rrd", "summary.png", "model.toml"}
     assert json.loads((folder / "report.json").read_text())["verdict"] == report.verdict
@@ -173,6 +174,25 @@ def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
         carlab.diagnose([])
     with pytest.raises(ConfigError, match="holdout-share"):
         carlab.diagnose(recording, held_out=csv_file(tmp_path / "other.csv"), holdout_share=0.2)
+
+
+def test_copy_of_a_fitted_recording_is_not_held_out(tmp_path: Path) -> None:
+    path, copy = csv_file(tmp_path / "drive.csv"), csv_file(tmp_path / "copy.csv")
+    with pytest.raises(ConfigError, match=r"copy\.csv has the content of .*drive\.csv; name one of them"):
+        carlab.diagnose(path, held_out=copy)
+    with pytest.raises(ConfigError, match=r"copy\.csv has the content of"):
+        carlab.compare(path, copy)
+    episode = carlab.load(path).episodes[0]
+    with pytest.raises(ConfigError, match="has the content of"):
+        carlab.diagnose(episode, held_out=episode)
+
+
+def test_each_predicted_recording_is_saved_with_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = []
+    monkeypatch.setattr("carlab.recording.episode_to_rrd", lambda episode, file, name, overlays: names.append(name))
+    paths = [csv_file(tmp_path / name) for name in ("first.csv", "second.csv")]
+    carlab.predict(paths, horizon_s=0.5).save(tmp_path / "predicted.rrd")
+    assert names == ["first.csv", "second.csv"]
 
 
 def test_one_name_need_not_be_in_a_list(tmp_path: Path) -> None:
