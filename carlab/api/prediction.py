@@ -117,7 +117,7 @@ class PredictionErrors:
         pairs = zip(self.score.episodes, self.score.overlays, strict=True)
         for number, (episode, overlay) in enumerate(pairs, start=1):
             file = first.with_name(f"{first.stem}-{number}.rrd") if several else first
-            name = Path(self.recordings.uses[0].path).name
+            name = Path(self.recordings.names[number - 1]).name
             episode_to_rrd(episode, file, name, overlays={"predicted": overlay})
             written.append(file)
         return written

@@ -162,7 +162,7 @@ def _prepare_recordings(
     settings = request.settings.windows
     nominal = request.nominal
     progress("reading", 0.0)
-    recorded_s = sum(len(e.times_s) for e in fit) * nominal.control_period_s
+    recorded_s = sum(len(e.times_s) * e.period_s for e in fit if e.ticks)
     fit, held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
     faults = (*request.data_faults, *own_faults)
     progress("reading", 0.03)

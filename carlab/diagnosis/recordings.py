@@ -12,7 +12,14 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.diagnosis.events import Event, EventUse, mark_events
 from carlab.diagnosis.findings import DataFault, Verdict
 from carlab.diagnosis.settings import DiagnosisSettings, WindowSettings
-from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of, split_segments
+from carlab.prediction.windows import (
+    HISTORY_S,
+    PredictionWindows,
+    RecordingSegment,
+    cut_windows,
+    segments_of,
+    split_segments,
+)
 from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -82,9 +89,11 @@ def split_recordings(
     cut = settings.windows
     fit_segments, held_out_segments = _split(fit, held_out, held_out_share, cut)
     check_excitation(fit_segments, cut)
-    fit_windows, fit_event_windows = _cut(fit_segments, cut.fit_window_s, cut.fit_stride_s, cut.max_fit_windows)
+    fit_windows, fit_event_windows = _cut(
+        fit_segments, "part to fit", cut.fit_window_s, cut.fit_stride_s, cut.max_fit_windows
+    )
     held_out_windows, event_windows = _cut(
-        held_out_segments, cut.held_out_window_s, cut.held_out_stride_s, cut.max_held_out_windows
+        held_out_segments, "held-out part", cut.held_out_window_s, cut.held_out_stride_s, cut.max_held_out_windows
     )
     events = (*_with_roles(fit_events, () if has_own else held_out_segments), *_held_out(held_out_events))
     use = EventUse(events, not keep_events, len(fit_event_windows), len(event_windows))
@@ -134,13 +143,20 @@ def _split(
 
 
 def _cut(
-    segments: Sequence[RecordingSegment], horizon_s: float, stride_s: float, max_windows: int
+    segments: Sequence[RecordingSegment], part: str, horizon_s: float, stride_s: float, max_windows: int
 ) -> tuple[PredictionWindows, PredictionWindows]:
     """Prediction windows without and with events. Raises Inconclusive without windows."""
     if not segments:
         raise Inconclusive("The recording is too short to hold out a part of it; record a longer drive (100 s).")
     try:
-        return cut_windows(segments, horizon_s, stride_s, with_events=True).thinned(max_windows).split_at_events()
+        cut = cut_windows(segments, horizon_s, stride_s, with_events=True)
+    except DataError as error:
+        raise Inconclusive(
+            f"In the {part} of the recordings the car moves in no stretch of {horizon_s + HISTORY_S:.1f} s; record a "
+            "longer drive, or name recordings of a moving car to fit and to hold out."
+        ) from error
+    try:
+        return cut.thinned(max_windows).split_at_events()
     except DataError as error:
         raise Inconclusive(str(error)) from error
 

@@ -58,9 +58,9 @@ def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, mo
     }
     try:
         make_folder(folder)
-        # An old report.json must not stand next to new pictures.
-        (folder / JSON_NAME).unlink(missing_ok=True)
-        (folder / PICTURE_NAME).unlink(missing_ok=True)
+        # Files of an earlier report must not stand next to new ones.
+        for name in (JSON_NAME, PICTURE_NAME, DECISIONS_NAME):
+            (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise DataError(describe_os_error(error, folder)) from error
     write_rrd(complete, figure_data, folder / RRD_NAME)
