@@ -77,10 +77,28 @@ def test_stop_without_a_change_is_inconclusive(first):
     assert stopped.sentence == "The comparison was stopped before all candidates were tested."
 
 
+def test_stop_after_a_change_is_stated(first, slower_servo):
+    slow = with_effect(CAR, "steering_lag").with_values({"effects.steering_lag.time_constant": LAG_S})
+    activities = []
+    stopped = compare(
+        [first],
+        [second(slow)],
+        CAR,
+        candidates=("steering_lag", "motor_lag", "motor.drive_gain"),
+        progress=lambda activity, share: activities.append(activity),
+        stop=lambda: "change 1" in activities,
+    )
+    assert stopped.verdict == "changed"
+    assert not stopped.is_complete
+    assert stopped.sentence.endswith("The comparison was stopped, so it may have missed further changes.")
+    assert slower_servo.is_complete
+    assert "stopped" not in slower_servo.sentence
+
+
 def test_result_that_cannot_be_written_is_refused_with_one_sentence(first, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file"):
-        carlab.compare([first], [first], "sim", out=tmp_path / "file" / "out", stop=lambda: True)
+        carlab.compare([first], [second(CAR)], "sim", out=tmp_path / "file" / "out", stop=lambda: True)
 
 
 def test_unusable_groups_are_refused_with_one_sentence(first):

@@ -77,10 +77,11 @@ def compare(
     progress("fitting the simulator to the first group", 0.0)
     compared = compared_groups(reference, changed, nominal, settings)
     screened = _screen(compared, candidates, settings, progress, stop)
-    changes, tested = _select(compared, screened, settings.comparison, progress, stop)
-    verdict: ComparisonVerdict = "changed" if changes else "inconclusive" if stop() else "nothing"
+    changes, tested, is_complete = _select(compared, screened, settings.comparison, progress, stop)
+    verdict: ComparisonVerdict = "changed" if changes else "nothing" if is_complete else "inconclusive"
     seconds = MonotonicClock().now_s() - began_s
-    return Comparison(verdict, verdict_sentence(verdict, changes), changes, seconds, tested)
+    sentence = verdict_sentence(verdict, changes, is_complete=is_complete)
+    return Comparison(verdict, sentence, changes, seconds, tested, is_complete)
 
 
 def _screen(
@@ -114,8 +115,8 @@ def _select(
     settings: ComparisonSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
-) -> tuple[tuple[Change, ...], tuple[Tested, ...]]:
-    """Forward selection: the change with the largest likelihood ratio comes first."""
+) -> tuple[tuple[Change, ...], tuple[Tested, ...], bool]:
+    """Forward selection, the largest likelihood ratio first; also all tests, and whether no stop ended it."""
     windows = [fitter.windows for fitter in compared.fitters]
     first, second = (
         GroupErrors(errors, w.block, part)
@@ -132,6 +133,7 @@ def _select(
     found: list[_Refined] = []
     ties: list[tuple[str, ...]] = []
     tested: tuple[Tested, ...] = ()
+    is_complete = True
     while len(found) < settings.max_changes and not stop():
         progress(f"change {len(found) + 1}", 0.75 + 0.08 * len(found))
         groups = (first, replace(second, errors=found[-1].fit.errors) if found else second)
@@ -149,11 +151,13 @@ def _select(
             break
         ties.append(_ties(best, refined, compared, settings.tie_z))
         found.append(best)
+    else:
+        is_complete = len(found) == settings.max_changes
     changes = [
         _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value), settings.model_error_share)
         for one, near in zip(found, ties, strict=True)
     ]
-    return tuple(changes), tested
+    return tuple(changes), tested, is_complete
 
 
 def _refine(

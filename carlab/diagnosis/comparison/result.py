@@ -73,6 +73,7 @@ class Comparison:
         changes: the changes, the strongest first.
         seconds: run time [s].
         tested: all candidates before any change is accepted, the most likely first.
+        is_complete: whether the comparison ended by itself; after a stop there may be more changes.
     """
 
     verdict: ComparisonVerdict
@@ -80,21 +81,23 @@ class Comparison:
     changes: tuple[Change, ...] = ()
     seconds: float = 0.0
     tested: tuple[Tested, ...] = ()
+    is_complete: bool = True
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the schema, ready for JSON."""
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def verdict_sentence(verdict: ComparisonVerdict, changes: Sequence[Change]) -> str:
-    """The verdict of a comparison that has enough data."""
+def verdict_sentence(verdict: ComparisonVerdict, changes: Sequence[Change], *, is_complete: bool) -> str:
+    """The verdict of a comparison that has enough data; ``is_complete``: whether no stop ended it."""
     if verdict == "inconclusive":
         return "The comparison was stopped before all candidates were tested."
     if not changes:
         return "These recordings show no change of the car between the two groups."
     falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
     names = listed([c.name for c in changes])
-    return f"Between the two groups changed: {names}. This lowers the loss of the second group by {falls}."
+    text = f"Between the two groups changed: {names}. This lowers the loss of the second group by {falls}."
+    return text if is_complete else f"{text} The comparison was stopped, so it may have missed further changes."
 
 
 def _product(factors: Sequence[float]) -> float:
