@@ -218,6 +218,7 @@ def test_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
     near = replace(near, held_out={k: replace(v, score=1.02) for k, v in near.held_out.items()})
     assert far.held_out[which].score > 3.0
     assert "the simulator lacks physics that the diagnosis does not find" in verdict_sentence(far)
+    assert "Only" not in verdict_title(far)
     assert "lacks physics" not in verdict_sentence(near)
 
 
@@ -313,6 +314,14 @@ def test_delays_of_both_commands_do_not_contradict_each_other() -> None:
         sentence = effect_sentence(effect_id, {"delay": around(0.06, "s")})
         assert "has an additional delay of 0.06 s" in sentence
         assert "later than" not in sentence
+
+
+def test_number_at_a_limit_without_information_has_no_interval() -> None:
+    at_limit = Estimate(0.0, 0.0, 0.0, 0.0, "s", at_limit=True)
+    sentence = effect_sentence("mocap_latency", {"latency": at_limit})
+    assert sentence.endswith("latency of 0 s (at the limit of its range; interval unknown).")
+    known = replace(at_limit, high90=0.001)
+    assert "(0 to 0.001 at 90 %; at the limit of its range)" in effect_sentence("mocap_latency", {"latency": known})
 
 
 def test_ceiling_without_a_predictable_part_states_no_share_of_it() -> None:

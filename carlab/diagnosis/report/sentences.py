@@ -34,7 +34,7 @@ AT_90 = " at 90 %"
 COUNTED = {1: "one effect", 2: "two effects", 3: "three effects", 4: "four effects"}
 VERDICT_TITLES = {
     "mismatch": "Missing physics is found and named",
-    "parameters": "Only parameters of the car file are wrong",
+    "parameters": "Parameters of the car file are wrong",
     "none": "No missing physics is found",
     "data": "The recording is faulty",
     "unexplained": "Physics outside the catalogue is missing",
@@ -82,6 +82,8 @@ def _scaled(value: float, factor: float, unit: str) -> str:
 def _interval(low: float, high: float, factor: float, at_limit: bool) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return " (interval unknown)" if math.isnan(low) or math.isnan(high) else " (open interval at 90 %)"
+    if at_limit and low == high:  # beyond a bound a fit has no information about the number
+        return " (at the limit of its range; interval unknown)"
     notes = "; its sign is not certain" if low < 0.0 < high else ""
     notes += "; at the limit of its range" if at_limit else ""
     return f" ({number(low * factor)} to {number(high * factor)}{AT_90}{notes})"
