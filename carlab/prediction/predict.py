@@ -119,8 +119,8 @@ def simulate_windows(
             ``config``.
         max_step_s: maximum integration step.
         ticks: indices (U,) of the ticks to return; all K + 1 by default.
-        in_double: simulate with 64 instead of 32 bits, which takes twice as long. Poses farther from the origin than
-            ``MAX_SINGLE_POSE`` always have 64 bits.
+        in_double: simulate with 64 instead of 32 bits, which takes twice as long. With effects that depend on the place,
+            poses farther from the origin than ``MAX_SINGLE_POSE`` always have 64 bits.
         engine: of the rollouts.
 
     Returns:
@@ -138,14 +138,14 @@ def simulate_windows(
     inner[COMMAND_DELAY] = np.asarray(delay_s)
     unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, parameter_std={})
     count = len(windows)
-    is_far = bool((np.abs(windows.initial_states[:, :3]) > MAX_SINGLE_POSE).any())
+    invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
+    start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
+    origin = _origins(start, effects)
+    is_far = bool((np.abs(start - origin)[..., :3] > MAX_SINGLE_POSE).any())
 
     def tensor(array: FloatArray) -> torch.Tensor:
         return torch.from_numpy(np.array(array, dtype=np.float64 if in_double or is_far else np.float32))
 
-    invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
-    start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
-    origin = _origins(start, effects)
     earlier = _past_of_hidden_states(windows, measurement, effects, origin)
     states = rollout(
         unmeasured,
