@@ -19,6 +19,7 @@ from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.selection.correlated_errors import without_unsupported_effects
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.rival_physics import RivalPhysics, additional_physics, replacing_physics
 from carlab.diagnosis.selection.search import restrict
@@ -90,11 +91,12 @@ def accept_names(
 def accept_requested_names(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, vibration: Vibration | None, control: RunControl
 ) -> NamingResult:
-    """Withdraw accepted effects that increase the held-out error, and model the residual.
+    """Withdraw accepted effects that are unsupported or increase the held-out error, and model the residual.
 
     For a search among requested effects. Most of the catalogue was not searched, so unnamed physics is no evidence
-    against the accepted effects.
+    against the accepted effects. Instead, they must hold with decorrelated errors.
     """
+    found = without_unsupported_effects(problem, found, control)
     if found.effects and _increases_held_out_error(found, held_out):
         log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
         found = found.without_effects()

@@ -11,7 +11,7 @@ from scipy import stats
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
 from carlab.diagnosis.comparison.drive_spread import DriveSpread, parts_of, spread_prior
-from carlab.diagnosis.comparison.error_model import CrossFittedErrors, ErrorModel
+from carlab.diagnosis.identification.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import PredictionWindows
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.comparison.error_model import ErrorModel
+from carlab.diagnosis.identification.error_model import ErrorModel
 from carlab.diagnosis.identification.fit import MAX_STEP, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.settings import ComparisonSettings

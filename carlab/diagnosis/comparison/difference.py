@@ -16,7 +16,7 @@ from scipy import stats
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.drive_spread import DriveSpread, spread_of_parts
-from carlab.diagnosis.comparison.error_model import ErrorModel
+from carlab.diagnosis.identification.error_model import ErrorModel
 from carlab.diagnosis.settings import ComparisonSettings
 from carlab.prediction.windows import IndexArray
 

@@ -11,7 +11,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.drive_spread import part_blocks, parts_of
-from carlab.diagnosis.comparison.error_model import CrossFittedErrors, ErrorModel
+from carlab.diagnosis.identification.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, stated_effects
 from carlab.diagnosis.identification.held_out_errors import noise_floor

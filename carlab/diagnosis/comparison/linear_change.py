@@ -16,8 +16,8 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.candidates import CandidatePoints, size_of
 from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
 from carlab.diagnosis.comparison.drive_spread import spread_prior
-from carlab.diagnosis.comparison.error_model import ErrorModel
 from carlab.diagnosis.comparison.result import Tested
+from carlab.diagnosis.identification.error_model import ErrorModel
 from carlab.diagnosis.settings import ComparisonSettings
 
 log = logging.getLogger(__name__)

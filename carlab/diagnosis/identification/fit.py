@@ -30,11 +30,13 @@ from sim_backends.effects import CURVES
 class Scale:
     """Standard deviations that whiten errors: ``sigma`` (U, 6) by step and channel, and the ``steps`` (U,).
 
-    ``sigma`` has the units of the errors: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+    ``sigma`` has the units of the errors: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]. ``root`` (6 U, 6 U)
+    decorrelates the errors of a window in standard deviations; without it, they count as independent.
     """
 
     steps: np.ndarray
     sigma: FloatArray
+    root: FloatArray | None = None
 
     @classmethod
     def of(
@@ -52,7 +54,18 @@ class Scale:
 
     def white(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
-        return error[..., self.steps, :] / self.sigma
+        return self.white_at_steps(error[..., self.steps, :])
+
+    def white_at_steps(self, error: FloatArray) -> FloatArray:
+        """Whitened errors (..., U, 6) of errors (..., U, 6) at the steps; none is infinite or NaN."""
+        white = bounded(error / self.sigma)
+        if self.root is None:
+            return white
+        return bounded((white.reshape(*white.shape[:-2], -1) @ self.root).reshape(white.shape))
+
+    def as_bytes(self) -> tuple[bytes, ...]:
+        """The content, to compare scales by."""
+        return tuple(b"" if each is None else each.tobytes() for each in (self.steps, self.sigma, self.root))
 
 
 MAX_STEP = 8.0
@@ -139,8 +152,7 @@ class Fitter:
     ) -> FloatArray:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(windows, config, values, ticks=self.scale.steps)
-            white = prediction_errors(predicted, windows, self.scale.steps) / self.scale.sigma
-        return bounded(white)
+            return self.scale.white_at_steps(prediction_errors(predicted, windows, self.scale.steps))
 
     def jacobian(
         self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray, white: FloatArray

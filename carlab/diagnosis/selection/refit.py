@@ -50,7 +50,7 @@ def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> Fl
 
 
 def _key(effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
-    return effects, start.tobytes(), scale.steps.tobytes(), scale.sigma.tobytes()
+    return effects, start.tobytes(), scale.as_bytes()
 
 
 def _fit_from(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Model:

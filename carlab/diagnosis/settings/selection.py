@@ -91,6 +91,14 @@ class SelectionSettings:
     best point use all windows."""
     keep_z_min: float = 1.2
     """One of several effects is removed if its removal costs less than this on left-out blocks [standard errors]."""
+    supported_z_min: float = 1.6449
+    """Minimum rise of the loss on left-out blocks without a requested effect, with decorrelated errors [standard
+    errors]: a one-sided test at 5 % (docs/decisions/0036)."""
+    error_ridge_share: float = 0.1
+    """Added to the diagonal of the errors' covariance, as a share of it; a few hundred dependent windows do not
+    determine the covariance of 36 errors."""
+    min_model_error: float = 1.0
+    """Squared excess of the robust errors over the noise floor from which errors count as those of the model."""
     min_practical_size: float = 0.2
     """Minimum size of an effect: the change of a channel at the end of the fitted windows by its removal and a refit,
     over the error that remains [noise floors, or robust errors of the simulator where these are larger]. A smaller

@@ -1,11 +1,12 @@
-"""Distribution of the reference model's errors on windows of the untouched recordings.
+"""Distribution of a model's errors on prediction windows, with its covariance.
 
-The errors of a window, by step and channel, have a multivariate Student-t distribution with the covariance that the
-first group shows. It contains the error of the model. Directions in which the model errs count little.
+The errors of a window, by step and channel, have a multivariate Student-t distribution. Its covariance contains the
+error of the model. Directions in which the model errs count little.
 
-The covariance fits the windows that it is estimated from better than others. So the errors of the first group are
-decorrelated by covariances of other folds (cross-fitting, Chernozhukov et al. 2018, "Double/debiased machine learning
-for treatment and structural parameters"), and the ridge has the largest likelihood on the folds that are left out.
+In a comparison the covariance is that of the first group. It fits the windows that it is estimated from better than
+others. So the errors of the first group are decorrelated by covariances of other folds (cross-fitting, Chernozhukov et
+al. 2018, "Double/debiased machine learning for treatment and structural parameters"), and the ridge has the largest
+likelihood on the folds that are left out.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class ErrorModel:
         """Scatter of errors (S, D) by expectation maximisation (Liu and Rubin 1995), with a ridge.
 
         Args:
-            errors: of the reference model.
+            errors: of the model.
             ridge_share: added to the diagonal of the scatter, as a share of it.
             settings: settings of the comparison.
         """
