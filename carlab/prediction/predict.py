@@ -119,8 +119,7 @@ def simulate_windows(
             ``config``.
         max_step_s: maximum integration step.
         ticks: indices (U,) of the ticks to return; all K + 1 by default.
-        in_double: simulate with 64 instead of 32 bits, which takes twice as long. With effects that depend on the place,
-            poses farther from the origin than ``MAX_SINGLE_POSE`` always have 64 bits.
+        in_double: simulate with 64 instead of 32 bits, which takes twice as long; always done where 32 are not enough.
         engine: of the rollouts.
 
     Returns:
@@ -158,9 +157,8 @@ def simulate_windows(
         max_step_s=max_step_s,
         engine=engine,
     ).states
-    rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
-    rows = rows.reshape(windows.steps + 1, 6, sets, count) + np.moveaxis(origin, -1, 0)
-    trajectory: list[State] = [tuple(tick) for tick in rows]
+    rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64).reshape(-1, 6, sets, count)
+    trajectory: list[State] = [tuple(tick) for tick in rows + np.moveaxis(origin, -1, 0)]
     return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
 
 

@@ -11,7 +11,7 @@ from carlab.cars import load_car_file
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Scale
 from carlab.diagnosis.selection.correlated_errors import decorrelating, without_unsupported_effects
-from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import fit_base, fit_with_scale
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.predict import simulate_windows

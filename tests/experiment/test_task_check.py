@@ -86,7 +86,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"sample_start": start(x_m=math.nan)}, "give finite numbers"),
     ({"sample_start": lambda self, rng: (0.0, 0.0, 0.0)}, "returns a tuple; return a carlab.CarState"),
     ({"sample_start": lambda self, rng: CarState(np.random.default_rng().normal() / 9)}, "two starts for one seed"),
-    ({"reward": lambda self, f, a, n: n[..., 0:1]}, r"reward returns the shape \(20, 1\) for features of shape \(20, F\);"),
+    (
+        {"reward": lambda self, f, a, n: n[..., 0:1]},
+        r"reward returns the shape \(20, 1\) for features of shape \(20, F\);",
+    ),
     ({"reward": lambda self, f, a, n: float(np.mean(n[..., 0]))}, r"reward returns the shape \(\)"),
     ({"reward": lambda self, f, a, n: n[0] * a[0]}, "reward of a batch raises ValueError"),
     ({"reward": lambda self, f, a, n: n[:, 0]}, "reward of one row raises IndexError"),
