@@ -13,7 +13,7 @@ from carlab.diagnosis.events import Event, EventUse, mark_events
 from carlab.diagnosis.findings import DataFault, Verdict
 from carlab.diagnosis.settings import DiagnosisSettings, WindowSettings
 from carlab.prediction.windows import (
-    HISTORY_S,
+    MIN_HISTORY_S,
     PredictionWindows,
     RecordingSegment,
     cut_windows,
@@ -152,8 +152,8 @@ def _cut(
         cut = cut_windows(segments, horizon_s, stride_s, with_events=True)
     except DataError as error:
         raise Inconclusive(
-            f"In the {part} of the recordings the car moves in no stretch of {horizon_s + HISTORY_S:.1f} s; record a "
-            "longer drive, or name recordings of a moving car to fit and to hold out."
+            f"In the {part} of the recordings the car moves in no stretch of {horizon_s + MIN_HISTORY_S:.1f} s; record "
+            "a longer drive, or name recordings of a moving car to fit and to hold out."
         ) from error
     try:
         return cut.thinned(max_windows).split_at_events()
