@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import can_stop_inside_batch, stopping_distance_m
@@ -40,6 +41,8 @@ class ExcitationSettings:
     """Weight of a speed in reverse."""
     step_s: float = 0.05
     """Step [s] of the prediction."""
+    stopping_s: float = 0.2
+    """Time [s] in which a slow car brakes to rest; a fast one brakes with the deceleration of the geofence."""
 
 
 class ExcitationPolicy:
@@ -87,14 +90,16 @@ class ExcitationPolicy:
         """The command that is held, a new one, or braking."""
         state = self._when_command_acts(view.observation.state)
         left_s = self._until_s - view.elapsed_s
-        if left_s > 0.0 and self._stay_inside(state, self._action.to_array()[None], np.array([left_s]))[0]:
+        if left_s > 0.0 and self._planned(state, self._action.to_array()[None], np.array([left_s]))[0][0]:
             return self._action
         commands, hold_s = self._draw()
-        inside = np.flatnonzero(self._stay_inside(state, commands, hold_s))[: self._settings.choices]
+        stays_inside, speed = self._planned(state, commands, hold_s)
+        inside = np.flatnonzero(stays_inside)[: self._settings.choices]
         if not len(inside):
             self._until_s = -math.inf
             return self._braking(state)
-        chosen = inside[int(np.argmax(self._preference(state, commands[inside], hold_s[inside])))]
+        preference = np.where(speed < 0.0, -self._settings.reverse_weight * speed, speed)
+        chosen = inside[int(np.argmax(preference[inside]))]
         self._action = Action.from_array(commands[chosen])
         self._until_s = view.elapsed_s + float(hold_s[chosen])
         return self._action
@@ -108,15 +113,10 @@ class ExcitationPolicy:
         steering = rng.uniform(-envelope.max_steering, envelope.max_steering, count)
         return np.stack([steering, sign * size], axis=1), rng.uniform(*settings.hold_s, count)
 
-    def _preference(self, state: CarState, commands: FloatArray, hold_s: FloatArray) -> FloatArray:
-        """Speed (n,) at the end of each command [m/s], with less weight in reverse."""
-        car = self._car
-        final = car.drive_gain_n * commands[:, 1] / car.damping_nspm
-        speed = final + (state.vx_mps - final) * np.exp(-hold_s * car.damping_nspm / car.mass_kg)
-        return np.where(speed < 0.0, -self._settings.reverse_weight * speed, speed)
-
-    def _stay_inside(self, state: CarState, commands: FloatArray, hold_s: FloatArray) -> np.ndarray:
-        """Whether the car can stop inside the arena at each moment of each command (n,)."""
+    def _planned(
+        self, state: CarState, commands: FloatArray, hold_s: FloatArray
+    ) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Whether the car can stop inside the arena at each moment of each command (n,), and its final speed [m/s]."""
         settings, envelope = self._settings, self._envelope
         steps = max(math.ceil(float(hold_s.max()) / settings.step_s), 1)
         place, course, speed = self._predicted(state, commands, steps)
@@ -127,7 +127,8 @@ class ExcitationPolicy:
             envelope.arena_m, place.reshape(-1, 2), course.ravel(), needed.ravel() + settings.margin_m
         ).reshape(course.shape)
         is_later = settings.step_s * np.arange(steps)[:, None] >= hold_s
-        return np.asarray((stops | is_later).all(axis=0))
+        last = (~is_later).sum(axis=0) - 1
+        return np.asarray((stops | is_later).all(axis=0)), speed[last, np.arange(len(hold_s))]
 
     def _predicted(
         self, state: CarState, commands: FloatArray, steps: int
@@ -165,6 +166,8 @@ class ExcitationPolicy:
     def _braking(self, state: CarState) -> Action:
         """Straight ahead, with the throttle that stops the car at the geofence's deceleration."""
         car, envelope = self._car, self._envelope
-        stop_mps2 = float(np.clip(state.vx_mps / 0.2, -envelope.deceleration_mps2, envelope.deceleration_mps2))
+        stop_mps2 = float(
+            np.clip(state.vx_mps / self._settings.stopping_s, -envelope.deceleration_mps2, envelope.deceleration_mps2)
+        )
         throttle = -car.mass_kg * stop_mps2 / car.drive_gain_n
         return Action(0.0, min(max(throttle, -envelope.max_throttle), envelope.max_throttle))
