@@ -169,5 +169,5 @@ class ExcitationPolicy:
         stop_mps2 = float(
             np.clip(state.vx_mps / self._settings.stopping_s, -envelope.deceleration_mps2, envelope.deceleration_mps2)
         )
-        throttle = -car.mass_kg * stop_mps2 / car.drive_gain_n
+        throttle = -car.mass_kg * stop_mps2 / max(car.drive_gain_n, 1e-6)
         return Action(0.0, min(max(throttle, -envelope.max_throttle), envelope.max_throttle))
