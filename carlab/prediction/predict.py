@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import partial
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -141,10 +142,7 @@ def simulate_windows(
     start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
     origin = _origins(start, effects)
     is_far = bool((np.abs(start - origin)[..., :3] > MAX_SINGLE_POSE).any())
-
-    def tensor(array: FloatArray) -> torch.Tensor:
-        return torch.from_numpy(np.array(array, dtype=np.float64 if in_double or is_far else np.float32))
-
+    tensor = partial(_tensor, dtype=np.float64 if in_double or is_far else np.float32)
     earlier = _past_of_hidden_states(windows, measurement, effects, origin)
     states = rollout(
         unmeasured,
@@ -157,9 +155,14 @@ def simulate_windows(
         max_step_s=max_step_s,
         engine=engine,
     ).states
-    rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64).reshape(-1, 6, sets, count)
-    trajectory: list[State] = [tuple(tick) for tick in rows + np.moveaxis(origin, -1, 0)]
+    rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
+    rows = rows.reshape(windows.steps + 1, 6, sets, count) + np.moveaxis(origin, -1, 0)
+    trajectory: list[State] = [tuple(tick) for tick in rows]
     return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
+
+
+def _tensor(array: FloatArray, dtype: type[np.floating[Any]]) -> torch.Tensor:
+    return torch.from_numpy(np.array(array, dtype=dtype))
 
 
 def _past_of_hidden_states(

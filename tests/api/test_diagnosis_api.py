@@ -157,6 +157,8 @@ def test_short_recording_is_inconclusive_with_a_reason(tmp_path: Path) -> None:
 def test_recordings_too_short_to_be_split_are_inconclusive_with_a_remedy(tmp_path: Path) -> None:
     """Of seven drives of 120 rows at 30 Hz, nothing remains before the held-out last part of each and its gap."""
     drives = [csv_file(tmp_path / f"{k}.csv") for k in range(7)]
+    for k, path in enumerate(drives):  # equal files are refused
+        path.write_text(path.read_text() + k * "\n")
     sentence = carlab.diagnose(drives).sentence
     assert "contain 28.0 s of driving, but only 0.0 s without the last part of each recording" in sentence
     assert "Hold out whole recordings with --held-out" in sentence

@@ -213,7 +213,7 @@ def test_policy_folder_that_is_no_run_is_refused(
     (run_folder / "models" / "0001" / "policy.npz").write_bytes(b"cposix\nmkdir\n(V/nonexistent/x\ntR.")
     options = ("--out", tmp_path / "runs")
     for policy, code_wanted, message in (
-        ("flying", 2, "--policy flying: choose one of parking, neutral"),
+        ("flying", 2, "--policy flying: choose one of parking, excitation, neutral"),
         ("mine.py", 2, "A policy of your own is an object in a Python script"),
         (tmp_path / "empty", 1, "is not the folder of a run of carlab learn"),
         (run_folder, 1, "cannot be read"),
