@@ -45,6 +45,12 @@ def _ignore_current_folder_in_children() -> None:
         os.environ["PYTHONSAFEPATH"] = "1"
 
 
+def _with_home_folder(argument: str) -> str:
+    """Expand ``~`` in ``~/file`` and ``--option=~/file``; a shell does not expand it after ``=``."""
+    option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+    return option + equals + os.path.expanduser(value)
+
+
 def run(argv: Sequence[str]) -> int:
     """Run one command line and return its exit code."""
     # A limit on threads prevents competing thread pools from delaying the control loop.
@@ -66,7 +72,7 @@ def run(argv: Sequence[str]) -> int:
 
         improve_help((*(each for each in verbs.values() if isinstance(each, type)), CarOptions, TaskOptions))
     verb = tyro.extras.subcommand_cli_from_dict(
-        verbs, args=with_current_methods(argv), prog="carlab", description=_DESCRIPTION
+        verbs, args=with_current_methods([_with_home_folder(a) for a in argv]), prog="carlab", description=_DESCRIPTION
     )
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:

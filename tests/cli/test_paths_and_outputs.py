@@ -373,3 +373,19 @@ def test_verbose_log_has_details_of_the_program_alone(monkeypatch: pytest.Monkey
     log_to_console(verbose=True)
     assert logging.getLogger("carlab.diagnosis").isEnabledFor(logging.DEBUG)
     assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.DEBUG)
+
+
+@pytest.mark.parametrize("target", [("--out=~/drive.csv",), ("--out", "~/drive.csv")])
+def test_home_folder_is_expanded_in_options(
+    carlab: Carlab, drive_csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: tuple[str, ...]
+) -> None:
+    """A shell expands ``~`` in neither of them: not after ``=``, and not in quotation marks."""
+    home, elsewhere = tmp_path / "home", tmp_path / "elsewhere"
+    home.mkdir()
+    elsewhere.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.chdir(elsewhere)
+    code, _ = carlab("export", drive_csv, *target)
+    assert code == 0
+    assert (home / "drive.csv").is_file()
+    assert list(elsewhere.iterdir()) == []
