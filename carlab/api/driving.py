@@ -235,6 +235,8 @@ def _check(
     at_least(1, episodes=episodes, ticks=ticks)
     valid_seed(seed=seed)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():
+        if len(Path(policy).parts) > 1 and not Path(policy).exists():
+            raise ConfigError(f"--policy {policy}: this folder does not exist; name the folder of a run.")
         raise ConfigError(
             f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn. A "
             "policy of your own is an object in a Python script: carlab.drive(policy=...), see examples/own_policy.py."

@@ -11,7 +11,7 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class EpisodeData:
     """An episode of T commands. Row k of ``sent`` was sent at ``times_s[k]`` and held until ``times_s[k + 1]``.
 
@@ -49,6 +49,10 @@ class EpisodeData:
         for name, (found, wanted) in shapes.items():
             if found != wanted:
                 raise DataError(f"{name} has shape {found}; {ticks} commands need {wanted}.")
+
+    def __repr__(self) -> str:
+        """Number of commands and duration; the arrays would fill pages."""
+        return f"<EpisodeData: {self.ticks} commands in {self.times_s[-1] - self.times_s[0]:.1f} s>"
 
     @property
     def ticks(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import functools
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -166,11 +167,15 @@ def track_from_table(table: Any, where: str) -> Track:
 
 
 def read_track(path: Path | str) -> Track:
-    """Read a track from a CSV file with the columns x, y and width [m] and a header. Raises ConfigError."""
+    """Read a track from a CSV file (commas or semicolons) with the columns x, y and width [m] and a header.
+
+    Raises:
+        ConfigError: it cannot be read or driven.
+    """
     try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            lines = [(reader.line_num, row) for row in reader if row and not row[0].lstrip().startswith("#")]
+        text = Path(path).read_text(encoding="utf-8-sig")
+        reader = csv.reader(io.StringIO(text), delimiter=";" if text.count(";") > text.count(",") else ",")
+        lines = [(reader.line_num, row) for row in reader if row and not row[0].lstrip().startswith("#")]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"The track {path} cannot be read ({reason}); name a CSV file with x, y, width.") from error
@@ -183,7 +188,7 @@ def read_track(path: Path | str) -> Track:
             rows.append([float(row[header.index(name)]) for name in COLUMNS])
         except (ValueError, IndexError) as error:
             raise ConfigError(f"Row {line_number} of the track {path} must have numbers for x, y and width.") from error
-    return _checked(rows, f"the track {path}")
+    return _checked(rows, f"The track {path}")
 
 
 def _checked(rows: list[list[float]], where: str) -> Track:

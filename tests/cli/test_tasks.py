@@ -215,6 +215,7 @@ def test_policy_folder_that_is_no_run_is_refused(
     for policy, code_wanted, message in (
         ("flying", 2, "--policy flying: choose one of parking, excitation, neutral"),
         ("mine.py", 2, "A policy of your own is an object in a Python script"),
+        (tmp_path / "nothing", 2, "nothing: this folder does not exist; name the folder of a run."),
         (tmp_path / "empty", 1, "is not the folder of a run of carlab learn"),
         (run_folder, 1, "cannot be read"),
         (user_run[2], 2, "name the file again: --task PATH/mine.py:Forward"),

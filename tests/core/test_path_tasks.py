@@ -132,6 +132,8 @@ def test_track_of_a_csv_file_and_of_a_table_are_equal(tmp_path: Path) -> None:
     file.write_text("# oval\nx_m, y_m, width_m\n0,0,0.5\n2,0,0.6\n2,2,0.7\n0,0,0.5\n")
     expected = Track(((0.0, 0.0), (2.0, 0.0), (2.0, 2.0)), (0.5, 0.6, 0.7))
     assert read_track(file) == expected
+    file.write_text(file.read_text().replace(",", ";"))
+    assert read_track(file) == expected
     assert track_from_table(expected.to_table(), "[track]") == expected
     assert track_from_table({"centre_line_m": [[0, 0], [2, 0], [2, 2]], "width_m": 0.5}, "").width_m == (0.5,) * 3
 
@@ -144,7 +146,7 @@ def test_track_of_a_csv_file_and_of_a_table_are_equal(tmp_path: Path) -> None:
         ("x,y,width\n0,0,a\n", "Row 2"),
         ("# oval\n\nx,y,width\n0,0,1\n\n1,0,a\n", "Row 6"),
         ("x,y,width\n0,0,1\n1,0,1\n2,0,1\n1,0,1\n", r"turns back on itself at \(0, 0\) m"),
-        ("x,y,width\n0,0,1\n1,0,1\n", "2 points"),
+        ("x,y,width\n0,0,1\n1,0,1\n", r"^The track .*track.csv has 2 points"),
         ("x,y,width\n0,0,1\n1,0,1\n1,0,1\n0,1,1\n", "two equal points"),
         ("x,y,width\n0,0,nan\n1,0,1\n0,1,1\n", "not finite"),
         (

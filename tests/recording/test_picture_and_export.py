@@ -12,6 +12,7 @@ import pytest
 from matplotlib.image import imread
 
 from carlab.api.recordings import Recording
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.recording.atomic_files import write_text
 from carlab.recording.csv.export import table_of, write_csv, write_parquet
@@ -147,3 +148,11 @@ def test_export_that_fails_leaves_no_file(tmp_path, episode, write, name):
     with pytest.raises(DataError, match=f"{name} could not be written: Is a directory"):
         write(episode, tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_episode_is_printed_in_one_line() -> None:
+    """Its arrays would fill pages of a Python session."""
+    states = np.zeros((91, 6))
+    commands = np.zeros((90, 2))
+    episode = EpisodeData(np.arange(91) / 30.0, states, commands, commands, np.zeros(90))
+    assert repr(episode) == "<EpisodeData: 90 commands in 3.0 s>"
