@@ -192,7 +192,7 @@ def test_held_out_share_is_not_fitted(
     path = tmp_path / "short.csv"
     path.write_text("\n".join(rows) + "\n")
     assert run(["diagnose", str(path), "--holdout-share", str(share), "--out", str(tmp_path / "out")]) == 5
-    found = re.search(r"to fit contain ([\d.]+) s", " ".join(capfd.readouterr().err.split()))
+    found = re.search(r"but only ([\d.]+) s without the last part", " ".join(capfd.readouterr().err.split()))
     assert found is not None
     assert float(found[1]) == pytest.approx((1.0 - share) * 12.0 - 1.5, abs=0.11)
 
