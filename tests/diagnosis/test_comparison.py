@@ -10,6 +10,8 @@ import carlab
 from carlab.cli import run
 from carlab.core.errors import ConfigError, DataError
 from carlab.diagnosis.comparison.compare import compare
+from carlab.diagnosis.comparison.result import Change
+from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.fit_parameters import with_effect
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -130,3 +132,13 @@ def test_verb_writes_the_result_of_the_call(first, tmp_path, capsys):
     assert saved["verdict"] == "nothing"
     assert run(["compare", str(paths[0]), "--with", str(paths[0])]) == 2
     assert "is in both groups" in capsys.readouterr().err
+
+
+def test_changed_base_parameter_keeps_its_name_in_a_sentence():
+    estimate = Estimate(0.5, 0.1, 0.3, 0.7, "N")
+    change = Change("motor.drive_gain", {"motor.drive_gain": estimate}, {"motor.drive_gain": 8.2}, 0.001, 0.2, 5.0)
+    assert change.sentence == "motor.drive_gain changed by 0.5 N (0.3 to 0.7 at 90 %), from 8.2 N."
+    lag = Change(
+        "steering_lag", {"time_constant": replace(estimate, unit="s")}, {"time_constant": 0.1}, 0.001, 0.2, 5.0
+    )
+    assert lag.sentence.endswith("changed: time_constant by 0.5 s (0.3 to 0.7 at 90 %), from 0.1 s.")
