@@ -15,7 +15,7 @@ ROWS, SEEDS = 100, (0, 1, 2)
 
 def held_out_nll(seed: int, draws: int, points: int) -> float:
     """Return the held-out NLL of a simulated race car with this many fixed draws and points."""
-    case = CASES["car"].ours or CASES["car"]
+    case = CASES["car"].body_frame or CASES["car"]
     data, units = case.data(ROWS, seed), case.normaliser
     noise, discrepancy = torch.tensor(case.prior_noise_std), case.prior_discrepancy * units.output_std
     with pytest.MonkeyPatch.context() as patch:
