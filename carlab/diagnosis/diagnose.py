@@ -41,7 +41,7 @@ from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
 from carlab.diagnosis.skill import skill_of
-from carlab.diagnosis.state_alignment import with_known_latency
+from carlab.diagnosis.state_alignment import naming_lost_frames, with_known_latency
 from carlab.diagnosis.uncertain_effects import without_uncertain_effects
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.jobs.function_workers import FunctionWorkers
@@ -167,9 +167,10 @@ def _prepare_recordings(
     faults = (*request.data_faults, *own_faults)
     progress("reading", 0.03)
     try:
-        recordings = split_recordings(
-            fit, held_out, request.held_out_share, nominal, request.settings, keep_events=request.keep_events
-        )
+        with naming_lost_frames((*fit, *held_out)):
+            recordings = split_recordings(
+                fit, held_out, request.held_out_share, nominal, request.settings, keep_events=request.keep_events
+            )
     except Inconclusive as error:
         error.data_faults = faults
         usable_s = sum(segment.duration_s for segment in segments_of(fit))

@@ -2,19 +2,23 @@
 
 A control loop uses the newest pose, whose age varies with the phase of motion capture, and velocities of a line through
 earlier poses, which are older. Both ages and all poses are recorded. A local quadratic through the poses gives the
-state at the tick minus the simulator's latency of motion capture. The difference between a velocity column and the
-line through its poses (the effect of a filter after the estimator) is added to the velocity.
+state at the tick minus the simulator's latency of motion capture. Where too many frames are lost for the quadratic, a
+local cubic through a wider window replaces it if its noise is not larger than that of a quadratic without lost frames.
+The difference between a velocity column and the line through its poses (the effect of a filter after the estimator) is
+added to the velocity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 
 from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.core.state_estimator import MIN_SAMPLES, fit_velocity
@@ -24,6 +28,8 @@ from sim_backends.car_parameters import LATENCY, SimulatorConfig
 HALF_WINDOW_S = 0.025
 """Half of the quadratic's window: seven poses at 120 Hz; at least two poses on each side."""
 MIN_POSES_PER_SIDE = 2
+CUBIC_HALF_WINDOW_S = 0.075
+"""Half of the window of the cubic where frames are lost; its bias is that of the widest quadratic."""
 MAX_LINE_POSES = 64
 MAX_AGE_MISMATCH_S = 5e-4
 """The poses of a velocity's line are identified if their mean time matches the recorded age within this."""
@@ -47,7 +53,7 @@ def align_states(episode: EpisodeData, latency_s: float) -> EpisodeData:
     if not known or len(poses) < 2 * MIN_POSES_PER_SIDE + 1:
         return episode
     poses = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
-    states = _quadratic(poses, episode.times_s - latency_s)
+    states = _local_states(poses, episode.times_s - latency_s)
     states[:, 3:] += _filter_offset(episode, poses)
     states[:, 2] = wrap(states[:, 2])
     seen = np.flatnonzero(np.isfinite(states).all(axis=1))
@@ -73,6 +79,37 @@ def with_known_latency(config: SimulatorConfig, episodes: Sequence[EpisodeData])
     return replace(config, unknown=config.unknown - {LATENCY}) if known else config
 
 
+def lost_frames(episodes: Sequence[EpisodeData]) -> tuple[int, str]:
+    """Number of rows without a state in aligned recordings, and a sentence with the share of lost frames."""
+    cut = [e for e in episodes if STATE_AGE in e.metadata and np.isnan(e.states).any()]
+    if not cut:
+        return 0, ""
+    missing = sum(int(np.isnan(e.states).any(axis=1).sum()) for e in cut)
+    counts = [_frame_counts(e.poses[:, 0]) for e in cut]
+    share = 1.0 - sum(seen for seen, _ in counts) / sum(total for _, total in counts)
+    rows = sum(len(e.times_s) for e in cut)
+    return missing, f"{share:.0%} of the motion-capture frames are lost, so {missing} of {rows} rows have no state"
+
+
+@contextmanager
+def naming_lost_frames(episodes: Sequence[EpisodeData]) -> Iterator[None]:
+    """Add the share of lost frames to the message of a DataError about aligned recordings."""
+    try:
+        yield
+    except DataError as error:
+        if sentence := lost_frames(episodes)[1]:
+            error.args = (f"{error} {sentence}; improve the tracking.",)
+        raise
+
+
+def _frame_counts(captures_s: FloatArray) -> tuple[int, int]:
+    """Number of recorded frames, and of all frames from the first to the last one."""
+    t_s = np.unique(captures_s)
+    gaps = np.diff(t_s)
+    frame_s = float(np.median(gaps[gaps < 1.5 * np.quantile(gaps, 0.1)]))
+    return len(t_s), round(float(t_s[-1] - t_s[0]) / frame_s) + 1
+
+
 def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
     """Variance [s2] of the window of the differentiation in ``align_states``; None if no recording was aligned.
 
@@ -91,26 +128,48 @@ def _half(gap_s: float) -> int:
     return max(MIN_POSES_PER_SIDE, round(HALF_WINDOW_S / gap_s))
 
 
-def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
-    """States (n, 6) at times (n,) of local quadratics through poses (P, 4); NaN if poses lie on one side only."""
+def _local_states(poses: FloatArray, at_s: FloatArray) -> FloatArray:
+    """States (n, 6) at times (n,) of local polynomials through poses (P, 4).
+
+    A row is NaN if poses lie on one side only, or if too many frames near it are lost.
+    """
     t_s = poses[:, 0]
     gap_s = float(np.median(np.diff(t_s)))
     half = _half(gap_s)
     widest_s = 2.0 * half * 1.5 * gap_s
+    complete = np.zeros((2 * half + 1, 4))
+    complete[:, 0] = gap_s * np.arange(-half, half + 1)
+    max_gain = 1.001 * _polynomial(complete, 0.0, 2)[1]
     states = np.full((len(at_s), 6), np.nan)
     for k, moment_s in enumerate(at_s):
         nearest = int(np.argmin(np.abs(t_s - moment_s)))
-        window = slice(max(nearest - half, 0), nearest + half + 1)
-        t = t_s[window] - moment_s
-        if min((t <= 1e-6).sum(), (t >= -1e-6).sum()) < MIN_POSES_PER_SIDE or t[-1] - t[0] > widest_s:
+        near = poses[max(nearest - half, 0) : nearest + half + 1]
+        if _has_both_sides(near, moment_s) and near[-1, 0] - near[0, 0] <= widest_s:
+            states[k] = _polynomial(near, moment_s, 2)[0]
             continue
-        scale = float(np.abs(t).max())
-        design = np.stack([np.ones_like(t), t / scale, (t / scale) ** 2], axis=1)
-        value, slope = (np.linalg.pinv(design) @ poses[window, 1:])[:2]
-        x, y, yaw = value
-        vx, vy, rate = slope / scale
-        states[k] = (x, y, yaw, *to_body(vx, vy, yaw), rate)
+        near = poses[np.abs(t_s - moment_s) <= CUBIC_HALF_WINDOW_S + 1e-6]
+        if _has_both_sides(near, moment_s):
+            state, gain = _polynomial(near, moment_s, 3)
+            if (gain <= max_gain).all():
+                states[k] = state
     return states
+
+
+def _has_both_sides(poses: FloatArray, moment_s: float) -> bool:
+    t = poses[:, 0] - moment_s
+    return bool(min((t <= 1e-6).sum(), (t >= -1e-6).sum()) >= MIN_POSES_PER_SIDE)
+
+
+def _polynomial(poses: FloatArray, moment_s: float, order: int) -> tuple[FloatArray, FloatArray]:
+    """State (6,) of a polynomial through poses (P, 4), and the noise gain (2,) of its pose and of its velocity [1/s].
+
+    The gain is the standard deviation of the estimate for poses with independent errors of standard deviation one.
+    """
+    t = poses[:, 0] - moment_s
+    scale = float(np.abs(t).max())
+    estimator = np.linalg.pinv(np.vander(t / scale, order + 1, increasing=True))[:2] / np.array([[1.0], [scale]])
+    (x, y, yaw), (vx, vy, rate) = estimator @ poses[:, 1:]
+    return np.array([x, y, yaw, *to_body(vx, vy, yaw), rate]), np.linalg.norm(estimator, axis=1)
 
 
 def _filter_offset(episode: EpisodeData, poses: FloatArray) -> FloatArray:
@@ -131,4 +190,4 @@ def _filter_offset(episode: EpisodeData, poses: FloatArray) -> FloatArray:
     return np.asarray(difference)
 
 
-__all__ = ["align_states", "window_variance_s2", "with_known_latency"]
+__all__ = ["align_states", "lost_frames", "naming_lost_frames", "window_variance_s2", "with_known_latency"]

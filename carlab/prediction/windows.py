@@ -321,10 +321,15 @@ def cut_windows(
         if np.hypot(*segment.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
         and (with_events or not segment.in_event[row : row + steps + 1].any())
     ]
+    needed_s = horizon_s + MIN_HISTORY_S
+    if all(len(segment.t_s) <= history_rows(period_s, MIN_HISTORY_S) + steps for segment in segments):
+        raise DataError(
+            f"The longest stretch without a gap has {max(segment.duration_s for segment in segments):.1f} s; a "
+            f"prediction needs {needed_s:.1f} s. Record a longer drive without gaps, or choose a shorter horizon."
+        )
     if not starts:
         raise DataError(
-            f"The car moves in no stretch of {horizon_s + MIN_HISTORY_S:.1f} s; record a longer drive, or choose "
-            "a shorter horizon."
+            f"The car moves in no stretch of {needed_s:.1f} s; record a longer drive, or choose a shorter horizon."
         )
     return PredictionWindows(
         period_s=period_s,

@@ -34,6 +34,7 @@ from carlab.diagnosis.comparison.result import Change, Comparison, ComparisonVer
 from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.fit import Fitter, clustered_gain
 from carlab.diagnosis.settings import DEFAULT, ComparisonSettings, DiagnosisSettings
+from carlab.diagnosis.state_alignment import naming_lost_frames
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.registry import REGISTRY
 
@@ -75,7 +76,8 @@ def compare(
     """
     began_s = MonotonicClock().now_s()
     progress("fitting the simulator to the first group", 0.0)
-    compared = compared_groups(reference, changed, nominal, settings)
+    with naming_lost_frames((*reference, *changed)):
+        compared = compared_groups(reference, changed, nominal, settings)
     screened = _screen(compared, candidates, settings, progress, stop)
     changes, tested, is_complete = _select(compared, screened, settings.comparison, progress, stop)
     verdict: ComparisonVerdict = "changed" if changes else "nothing" if is_complete else "inconclusive"

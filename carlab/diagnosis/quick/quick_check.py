@@ -25,7 +25,7 @@ from carlab.diagnosis.quick.causes import Cause, find_causes, scale_of
 from carlab.diagnosis.quick.conditions import ErrorCondition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
 from carlab.diagnosis.settings import DEFAULT, QuickSettings
-from carlab.diagnosis.state_alignment import align_states, window_variance_s2, with_known_latency
+from carlab.diagnosis.state_alignment import align_states, lost_frames, window_variance_s2, with_known_latency
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
@@ -118,7 +118,8 @@ def quick_check(
         windows, floor = _windows(repaired, simulator, window_variance_s2(usable), settings)
     except DataError:
         length_s = settings.window_s + MIN_HISTORY_S
-        return replace(undecided, why=f"the car moves in no stretch of {length_s:.1f} s.")
+        why = f"the car moves in no stretch of {length_s:.1f} s without a gap"
+        return replace(undecided, why="; ".join(filter(None, (why, lost_frames(captured)[1]))) + ".")
     if len(windows) < settings.min_windows:
         return replace(undecided, why=f"the car moves in only {len(windows)} windows of {settings.window_s:.1f} s.")
     return _checked(undecided, windows, floor, simulator, settings)

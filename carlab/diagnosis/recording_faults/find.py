@@ -11,6 +11,7 @@ from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair, merg
 from carlab.diagnosis.recording_faults.integration_step import check_integration
 from carlab.diagnosis.recording_faults.pose import check_pose
 from carlab.diagnosis.recording_faults.velocity import check_velocities
+from carlab.diagnosis.state_alignment import lost_frames
 from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -41,5 +42,8 @@ def check(
     check_commands([repair for repair in usable if repair.usable], nominal)
     repaired = [repair.result() for repair in repairs]
     faults = merged([fault for repair in repairs for fault in repair.faults])
+    rows, sentence = lost_frames(repaired)
+    if rows:
+        faults.append(DataFault("lost_frames", "x, y, yaw", rows, f"reported: {sentence}."))
     faults += check_integration(repaired[: len(fit)], nominal)
     return repaired[: len(fit)], repaired[len(fit) :], faults
