@@ -1,6 +1,7 @@
 """Parallel child processes with measured memory that can be stopped between tasks or killed.
 
 Each child has its own session, so ^C at the terminal reaches only the parent. The parent lets running children finish.
+If the parent is killed, its children are killed too.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ import os
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -20,6 +22,8 @@ from carlab.core.clock import MonotonicClock
 POLL_S = 0.02
 OUTPUT_TAIL_BYTES = 2000
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+KILL_AT_END_OF_INPUT = ("/bin/sh", "-c", 'read line || kill -s KILL -- "-$0"')
+"""Command that waits for the end of its standard input and then kills the process group of its argument."""
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -72,16 +76,17 @@ def run_child(
         too_long = abandoned = False
         ended = 0
         try:
-            while not ended:
-                ended, status, usage = os.wait4(child.pid, os.WNOHANG)
-                if ended:
-                    child.returncode = os.waitstatus_to_exitcode(status)
-                    break
-                too_long = too_long or clock.now_s() - begin_s > timeout_s
-                abandoned = abandoned or abandon()
-                if too_long or abandoned:
-                    _kill_session(child.pid)
-                clock.sleep_until(clock.now_s() + POLL_S)
+            with _killed_with_this_process(child.pid):
+                while not ended:
+                    ended, status, usage = os.wait4(child.pid, os.WNOHANG)
+                    if ended:
+                        child.returncode = os.waitstatus_to_exitcode(status)
+                        break
+                    too_long = too_long or clock.now_s() - begin_s > timeout_s
+                    abandoned = abandoned or abandon()
+                    if too_long or abandoned:
+                        _kill_session(child.pid)
+                    clock.sleep_until(clock.now_s() + POLL_S)
         except BaseException:
             _kill_session(child.pid)
             child.wait()
@@ -93,6 +98,29 @@ def run_child(
         output = f"ended after {timeout_s:g} s"
     code = None if too_long else int(child.returncode)
     return ChildEnd(code, seconds, output, usage.ru_maxrss / 1024.0, abandoned)
+
+
+@contextmanager
+def _killed_with_this_process(pid: int) -> Iterator[None]:
+    """Kill the session of a child if this process is killed before the block ends.
+
+    A shell waits for the end of a pipe, of which only this process has the other end. PR_SET_PDEATHSIG would need code
+    between fork and exec, and would reach neither the children of the child nor outlive the thread that started it.
+    """
+    to_read, to_write = os.pipe()
+    try:
+        guard = subprocess.Popen(
+            (*KILL_AT_END_OF_INPUT, str(pid)), stdin=to_read, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )  # fmt: skip
+        try:
+            yield
+        finally:
+            guard.kill()
+            guard.wait()
+    finally:
+        os.close(to_read)
+        os.close(to_write)
 
 
 def _kill_session(pid: int) -> None:
