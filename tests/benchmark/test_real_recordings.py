@@ -19,6 +19,7 @@ from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, r
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
 from sim_backends import SimulatorConfig, rollout
+from sim_backends.effects import CATALOGUE
 
 PERIOD_S = 1.0 / 30.0
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_comparison.py")))
@@ -253,6 +254,47 @@ def test_size_of_the_other_correct_name_is_added_to_its_own_parameter() -> None:
             row = score_comparison(truth, report((named, names[named], true + 0.001)), model)
             assert row["sizes"][0]["true"] == pytest.approx(true)
             assert row["sizes"][0]["covered"]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.id)
+def test_identity_of_a_kind_is_that_of_the_catalogue(kind: Kind) -> None:
+    parameters = [p for name in kind.names if name in CATALOGUE for p in CATALOGUE[name].parameters]
+    changed = {truth.parameter for truth in kind.apply(simulated(commands(12.0)), kind.sizes[0], 0.3).truth}
+    for parameter in parameters:
+        if parameter.name in changed and parameter.identity is not None:
+            assert kind.identity == parameter.identity
+
+
+def test_size_against_an_infinite_identity_has_no_standard_deviations() -> None:
+    truth = answer(
+        "steering_nonlinearity", ["steering_nonlinearity"], parameter="saturation", size=0.9, composes="replaces",
+        per_lock=True,
+    )  # fmt: skip
+    model = {"steering": {"max_angle": 0.5}}
+    named = report(("steering_nonlinearity", "saturation", 0.44))
+    row = score_comparison(truth, named, model)
+    assert row["sizes"][0]["true"] == pytest.approx(0.45)
+    assert row["sizes"][0]["covered"]
+    assert row["sizes"][0]["stds"] is None
+    tested = [{"id": "steering_nonlinearity", "parameters": {"saturation": 0.44}, "standard_errors": 9.0}]
+    unnamed = score_comparison(truth, {**report(), "tested": tested}, model)
+    rows = {"named": row, "unnamed": unnamed}
+    add_visibility(rows)
+    assert [each["stds"] for each in rows.values()] == [None, None]
+    stated = {**model, "effects": {"steering_nonlinearity": {"saturation": 0.6}}}
+    assert score_comparison(truth, named, stated)["sizes"][0]["stds"] == pytest.approx(15.0)
+
+
+def test_change_to_a_value_counts_from_the_value_in_the_first_group() -> None:
+    truth = answer(
+        "steering_nonlinearity", ["steering_nonlinearity"], parameter="saturation", size=0.9, composes="replaces",
+        per_lock=True,
+    )  # fmt: skip
+    named = report(("steering_nonlinearity", "saturation", 0.45 - 20.0))
+    named["changes"][0]["reference"] = {"saturation": 20.0}
+    size = score_comparison(truth, named, {"steering": {"max_angle": 0.5}})["sizes"][0]
+    assert size["true"] == pytest.approx(0.45 - 20.0)
+    assert size["covered"]
 
 
 def test_sets_and_spurious_names() -> None:

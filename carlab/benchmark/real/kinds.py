@@ -51,7 +51,8 @@ class Kind:
     """A kind of effect.
 
     ``names`` are the ids that are correct answers; several where the transformed recordings are identical. The
-    function gets the recording, the size and a random sign or angle in [0, 1).
+    function gets the recording, the size and a random sign or angle in [0, 1). ``identity`` is the value of the
+    parameter at which the effect does nothing.
     """
 
     id: str
@@ -59,6 +60,7 @@ class Kind:
     channel: Channel
     sizes: tuple[float, float, float]
     change: Callable[[Table, float, float], TransformedRecording]
+    identity: float = 0.0
 
     def apply(self, table: Table, size: float, draw: float) -> TransformedRecording:
         """Return the recording of a car with the effect."""
@@ -181,9 +183,9 @@ KINDS = (
     Kind("steering_asymmetry", ("steering_asymmetry",), "steering", (0.05, 0.1, 0.2), _asymmetry),
     Kind("steering_deadband", ("steering_deadband",), "steering", (0.08, 0.16, 0.3), _steering_dead_band),
     Kind("steering_backlash", ("steering_backlash",), "steering", (0.08, 0.16, 0.3), _play),
-    Kind("steering_nonlinearity", ("steering_nonlinearity",), "steering", (0.06, 0.12, 0.24), _saturation),
+    Kind("steering_nonlinearity", ("steering_nonlinearity",), "steering", (0.06, 0.12, 0.24), _saturation, math.inf),
     Kind("throttle_deadband", ("throttle_deadband",), "throttle", (0.03, 0.06, 0.12), _throttle_dead_band),
-    Kind("throttle_nonlinearity", ("throttle_nonlinearity",), "throttle", (0.1, 0.25, 0.5), _exponent),
+    Kind("throttle_nonlinearity", ("throttle_nonlinearity",), "throttle", (0.1, 0.25, 0.5), _exponent, 1.0),
     Kind("marker_offset", ("marker_offset",), "observation", (0.01, 0.02, 0.04), _marker),
     Kind("mocap_yaw_misalignment", ("mocap_yaw_misalignment",), "observation", (0.01, 0.02, 0.04), _misalignment),
     Kind("velocity_filter_lag", ("velocity_filter_lag",), "observation", (0.03, 0.06, 0.12), _filter),

@@ -11,6 +11,7 @@ import numpy as np
 from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.matching import Correctness, assigned
 from carlab.benchmark.proof.results_page import markdown
+from carlab.benchmark.real.kinds import KINDS
 from carlab.core.errors import DataError
 
 CHANGES = {"carlab.compare/1": "changes", "carlab.diagnosis/1": "effects"}
@@ -20,7 +21,7 @@ VISIBLE_STDS = 2.0
 NAMEABLE_STDS = 6.0
 """A size that a test of about 50 candidates with 5 % false alarms and 15 degrees of freedom finds in 9 of 10 cases: the
 two-sided quantile of Student's distribution at 0.05 / 50 is 4.1, a power of 0.9 needs 1.3 more; rounded up."""
-IDENTITY = {"exponent": 1.0}
+IDENTITIES = {name: kind.identity for kind in KINDS for name in kind.names}
 Json = Mapping[str, Any]
 Rows = Mapping[str, Json]
 
@@ -91,6 +92,8 @@ def _unnamed_stds(effect: Json, report: Json | None, model: Json) -> float | Non
             truth = effect["truth"][0]
             value = next(iter(values.values()))
             true = true_value(truth, tested["id"], model) - _before(tested["id"], truth["parameter"], model)
+            if math.isinf(true):
+                return None
             return abs(true) * float(tested["standard_errors"]) / max(abs(float(value)), 1e-12)
     return None
 
@@ -109,22 +112,21 @@ def _sizes(effect: Json, change: Json, model: Json) -> list[dict[str, Any]]:
         value = true_value(truth, change["id"], model)
         size = abs(value - before)
         if "reference" in change:  # a comparison reports changes
-            value = _true_change(truth, change, value - before)
+            value = _true_change(truth, change, value, before)
         found.append({
             "parameter": f"{change['id']}.{parameter}", "true": value, "value": estimate["value"],
             "std": estimate["std"], "covered": estimate["low90"] <= value <= estimate["high90"],
-            "stds": size / max(estimate["std"], 1e-12),
+            "stds": size / max(estimate["std"], 1e-12) if math.isfinite(size) else None,
         })  # fmt: skip
     return found
 
 
-def _true_change(truth: Json, change: Json, added: float) -> float:
+def _true_change(truth: Json, change: Json, value: float, before: float) -> float:
     """Change of a parameter in a comparison, from its value in the first group."""
     reference = change["reference"]
-    first = reference.get(truth["parameter"], next(iter(reference.values())))
-    if truth["composes"] == "multiplies":
-        return float(first) * (float(truth["size"]) - 1.0)
-    return float(truth["size"]) - float(first) if truth["composes"] == "replaces" and not truth["per_lock"] else added
+    first = float(reference.get(truth["parameter"], next(iter(reference.values()))))
+    changes = {"adds": value - before, "multiplies": first * (float(truth["size"]) - 1.0), "replaces": value - first}
+    return changes[truth["composes"]]
 
 
 def true_value(truth: Json, name: str, model: Json) -> float:
@@ -135,13 +137,13 @@ def true_value(truth: Json, name: str, model: Json) -> float:
 
 
 def _before(name: str, parameter: str, model: Json) -> float:
-    """The parameter in the reference's car file; its identity if the effect is absent (infinite: 0)."""
+    """The parameter in the reference's car file; its identity if the effect is absent."""
     if "." in name:
         return _base_value(name, model)
     entry = model.get("effects", {}).get(name, {}).get(parameter)
     if entry is None and parameter == "latency":
         entry = model.get("mocap", {}).get("latency", 0.0)
-    return IDENTITY.get(parameter, 0.0) if entry is None else _number(entry)
+    return IDENTITIES.get(name, 0.0) if entry is None else _number(entry)
 
 
 def _base_value(name: str, model: Json) -> float:
@@ -159,18 +161,22 @@ def add_visibility(rows: Rows) -> None:
     """Set ``stds`` of each single case: its size in standard deviations of the tool.
 
     An effect that is not named takes its linear estimate, if the report has one. Otherwise it takes the median ratio of
-    size to deviation of the named cases of its kind and size; without any such case it stays None.
+    size to deviation of the named cases of its kind and size; without any such case it stays None. It stays None too
+    for an effect with an infinite identity, whose size is not finite.
     """
     singles = [row for row in rows.values() if row["kind"] == "single"]
     for row in singles:
-        own = [size["stds"] for size in row["sizes"]]
+        own = [size["stds"] for size in row["sizes"] if size["stds"] is not None]
         row["stds"] = max(own) if own else row.get("unnamed_stds")  # type: ignore[index]
     for row in singles:
         if row["stds"] is None:
             alike = [
                 other["stds"]
                 for other in singles
-                if other["true"] == row["true"] and other["sizes"] and other["size_index"] == row["size_index"]
+                if other["true"] == row["true"]
+                and other["sizes"]
+                and other["size_index"] == row["size_index"]
+                and other["stds"] is not None
             ]
             row["stds"] = float(np.median(alike)) if alike else None  # type: ignore[index]
 
