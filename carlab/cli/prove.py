@@ -199,6 +199,8 @@ class Prove:
             raise ConfigError(
                 f"{self.out} has no finished diagnosis with decisions.json; run the same command without --calibrate."
             )
+        if not self.set.endswith("development"):
+            console.print(f"--set {self.set} is a test set: thresholds must not be chosen on its rates.")
         rates = calibrate(proof.open_seal(), decisions)
         table(f"{len(decisions)} cases; * marks the present value", list(COLUMNS), [r.row() for r in rates])
         return 0

@@ -78,6 +78,16 @@ def test_folder_without_decisions_raises_an_error(tmp_path: Path, capfd: pytest.
     assert "run the same command without --calibrate" in " ".join(capfd.readouterr().err.split())
 
 
+@pytest.mark.parametrize("name", ["short", "full", "hard", "development", "hard-development"])
+def test_rates_of_a_test_set_have_a_warning(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    (tmp_path / "seal.json").touch()
+    monkeypatch.setattr(Proof, "decisions", lambda proof: DECISIONS)
+    monkeypatch.setattr(Proof, "open_seal", lambda proof: ANSWERS)
+    assert run(["prove", "--set", name, "--calibrate", "--out", str(tmp_path)]) == 0
+    warning = f"--set {name} is a test set: thresholds must not be chosen on its rates."
+    assert (warning in capsys.readouterr().out) == ("development" not in name)
+
+
 def test_decisions_of_finished_runs_are_read_with_the_names_of_their_cases(tmp_path: Path) -> None:
     proof = Proof(tmp_path, [CaseSpec("null", 1)])
     for name, made in DECISIONS.items():
