@@ -149,6 +149,14 @@ def test_impossible_correction_changes_nothing() -> None:
     assert "its correction is impossible" in version.sentence
 
 
+IMPOSSIBLE_VALUES = (
+    ("effects.renamed.gain", 1.0),
+    ("motor.drive_gain", math.inf),
+    ("vehicle.mass", math.nan),
+    ("vehicle.mass", -1.0),
+)
+
+
 def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path, "run")
     path = correction_path(run, 1)
@@ -163,10 +171,16 @@ def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
         *("{", "[]", '{"corrections": [1], "history": 4, ' + rest),
         *('{"corrections": [], "history": ' + history + ", " + rest for history in ("-1", "1e9", "NaN", "1e999")),
         '{"corrections": [], "history": 4, "sentence": "", "diagnosed": 1e999}',
-        json.dumps(PriorVersion((replace(MOTOR_LAG, values={"effects.renamed.gain": 1.0}),)).to_dict()),
+        *(
+            json.dumps(PriorVersion((replace(MOTOR_LAG, **changed),)).to_dict())
+            for changed in (
+                *({"values": {name: value}} for name, value in IMPOSSIBLE_VALUES),
+                *({"std": {"effects.motor_lag.time_constant": std}} for std in (-0.01, 0.0, math.nan, math.inf)),
+            )
+        ),
     ):
         path.write_text(content)
-        with pytest.raises(DataError, match=r"remove it, and the run repeats the correction\.$"):
+        with pytest.raises(DataError, match=r"repair\.json .*remove it, and the run repeats the correction\.$"):
             read_version(run, 1)
 
 

@@ -97,6 +97,11 @@ class PriorVersion:
         )  # fmt: skip
         if unknown := {name for c in corrections for name in (*c.values, *c.std)} - REGISTRY.keys():
             raise ValueError(f"unknown number {min(unknown)!r}")
+        for c in corrections:
+            problems = [problem for name, value in c.values.items() if (problem := REGISTRY[name].problem(value))]
+            problems += [f"std of {name} is {std:g}" for name, std in c.std.items() if not 0.0 < std < math.inf]
+            if problems:
+                raise ValueError(problems[0])
         history = int(content["history"])
         if not 0 <= history <= LARGEST_GIVEN_HISTORY:
             raise ValueError(f"history is {history}")
