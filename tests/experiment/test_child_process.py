@@ -74,3 +74,13 @@ def test_child_has_the_imports_and_no_open_file_of_its_parent(tmp_path: Path) ->
     assert {"torch", "carlab.experiment.campaign.training", "learning.policy.sac_agent"} <= set(seen["modules"])
     assert seen["open"]
     assert port.name not in seen["open"]
+
+
+def test_script_from_standard_input_gets_the_result_of_its_child() -> None:
+    script = (
+        "import math\n"
+        "from carlab.experiment.campaign.child_process import run_in_child\n"
+        "print(run_in_child('root', math.sqrt, (4.0,), lambda: False), __file__)\n"
+    )
+    ended = subprocess.run([sys.executable, "-"], input=script, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (0, "2.0 <stdin>\n"), ended.stderr

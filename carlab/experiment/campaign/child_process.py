@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
+from pathlib import Path
 from typing import Any
 
 from carlab.core.errors import CarlabError
@@ -60,6 +62,21 @@ def interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def _without_main_that_is_no_file() -> Iterator[None]:
+    """Hide the name of a script from standard input (``<stdin>``), which a new process would try to execute."""
+    main = vars(sys.modules["__main__"])
+    name = main.get("__file__")
+    if name is None or Path(name).is_file():
+        yield
+        return
+    del main["__file__"]
+    try:
+        yield
+    finally:
+        main["__file__"] = name
+
+
 def run_in_child(
     name: str,
     function: Callable[..., Any],
@@ -89,7 +106,8 @@ def run_in_child(
     receiver, sender = context.Pipe(duplex=False)
     call = (sender, name, function, arguments, on_report is not None, expected)
     child = context.Process(target=_call, args=call, daemon=True, name=name)
-    child.start()
+    with _without_main_that_is_no_file():
+        child.start()
     sender.close()
     try:
         while not stop():
