@@ -111,10 +111,6 @@ class ClockAlignment:
             return
         self._fit()
 
-    def to_host_s(self, server_ticks: int) -> float:
-        """Host monotonic time [s] of a server stamp; NaN before the first echo."""
-        return self._to_host(server_ticks / self.clock_hz) if self._reference is not None else float("nan")
-
     def exposure(self, exposed_ticks: int, transmit_ticks: int, received_s: float) -> Exposure:
         """Time of exposure of a frame that arrived at ``received_s`` [s, host monotonic].
 

@@ -59,11 +59,6 @@ class DiagnosisReport:
     held_out_names: tuple[str, ...] = ()
 
     @property
-    def exhibits(self) -> FigureData:
-        """The former name of ``figure_data``."""
-        return self.figure_data
-
-    @property
     def verdict(self) -> Verdict:
         """One of mismatch, parameters, none, data, unexplained, inconclusive."""
         return self.diagnosis.verdict

@@ -88,8 +88,6 @@ class CanLink:
         except (can.CanError, OSError) as error:
             self._flush()
             raise self._failed(error) from error
-        self.statistics.frames_out += 1
-        self.statistics.bytes_out += len(frame.data)
 
     def read(self) -> list[CanFrame]:
         """Frames that have arrived. Raises ActuatorFaultError on bus-off or a lost adapter."""
@@ -109,8 +107,6 @@ class CanLink:
                     raise self._failed("the controller went bus-off")
             elif message.is_extended_id and not message.is_remote_frame:
                 frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
-                self.statistics.bytes_in += len(message.data)
-        self.statistics.frames_in += len(frames)
         return frames
 
     def fileno(self) -> int | None:

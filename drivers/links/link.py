@@ -1,4 +1,4 @@
-"""Interfaces of links: byte streams and frame buses, with counts of their traffic."""
+"""Interfaces of links: byte streams and frame buses, with counts of events."""
 
 from __future__ import annotations
 
@@ -16,14 +16,9 @@ class CanFrame:
 
 @dataclass(slots=True)
 class LinkStatistics:
-    """Traffic counts since construction."""
+    """Counts since construction."""
 
-    bytes_out: int = 0
-    bytes_in: int = 0
-    frames_out: int = 0
-    frames_in: int = 0
     writes: int = 0
-    discarded_bytes: int = 0
     error_frames: int = 0
     opens: int = 0
 

@@ -56,10 +56,8 @@ class SerialLink:
         """
         port = self._opened()
         try:
-            backlog = port.out_waiting
-            if backlog > BACKLOG_LIMIT_BYTES:
+            if port.out_waiting > BACKLOG_LIMIT_BYTES:
                 port.reset_output_buffer()
-                self.statistics.discarded_bytes += backlog
             is_written = self._write_all(port.fileno(), data)
         except (OSError, termios.error) as error:
             raise self._lost(error) from error
@@ -68,7 +66,6 @@ class SerialLink:
             raise ActuatorFaultError(
                 f"{self.port} accepts no more bytes; check that the device is powered, then reset the fault."
             )
-        self.statistics.bytes_out += len(data)
         self.statistics.writes += 1
 
     def _write_all(self, fd: int, data: bytes) -> bool:
@@ -92,7 +89,6 @@ class SerialLink:
             data: bytes = port.read(waiting) if waiting else b""
         except (OSError, termios.error, TypeError) as error:
             raise self._lost(error) from error
-        self.statistics.bytes_in += len(data)
         return data
 
     def fileno(self) -> int | None:

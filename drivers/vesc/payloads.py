@@ -28,7 +28,6 @@ class Command(enum.IntEnum):
     SET_RPM = 8
     SET_SERVO_POS = 12
     ALIVE = 30
-    FORWARD_CAN = 34
     GET_VALUES_SELECTIVE = 50
 
 

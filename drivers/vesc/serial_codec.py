@@ -48,11 +48,6 @@ class VescFrameDecoder:
     _buffer: bytearray = field(default_factory=bytearray)
     _t_last_byte_s: float = 0.0
 
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes of an unfinished frame."""
-        return len(self._buffer)
-
     def feed(self, data: bytes, t_s: float) -> list[bytes]:
         """Add bytes that arrived at ``t_s`` (any monotonic clock; may be empty) and return complete payloads."""
         payloads: list[bytes] = []

@@ -141,9 +141,7 @@ class AnalogSource(NamedTuple):
     channels: tuple[tuple[float, ...], ...]
 
 
-FRAME_RECORDING = 0x01
 FRAME_MODELS_CHANGED = 0x02
-FRAME_EDIT_MODE = 0x04
 FRAME_BITSTREAM_CHANGED = 0x08
 
 

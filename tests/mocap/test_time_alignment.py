@@ -29,10 +29,16 @@ def echo(alignment: ClockAlignment, clock: ServerClock, sent_s: float, out_s: fl
     alignment.add_echo(sent_s, clock.ticks(sent_s + out_s), sent_s + out_s + back_s)
 
 
+def exposure_s(alignment: ClockAlignment, clock: ServerClock, at_s: float) -> float:
+    """Estimated host time of an exposure at ``at_s``, of a frame that arrives half a second later."""
+    exposure = alignment.exposure(clock.ticks(at_s), clock.ticks(at_s), at_s + 0.5)
+    assert exposure.is_aligned
+    return exposure.capture_s
+
+
 def test_alignment_is_unknown_before_the_first_echo() -> None:
     alignment = ClockAlignment(CLOCK_HZ)
     assert not alignment.is_aligned
-    assert math.isnan(alignment.to_host_s(5))
     assert math.isnan(alignment.round_trip_s)
 
 
@@ -41,7 +47,7 @@ def test_alignment_is_unknown_before_the_first_echo() -> None:
 def test_error_of_one_echo_is_at_most_half_the_round_trip(offset_s: float, out_s: float) -> None:
     clock, alignment = ServerClock(offset_s, 0.0), ClockAlignment(CLOCK_HZ)
     echo(alignment, clock, 100.0, out_s, 1e-3 - out_s)
-    assert abs(alignment.to_host_s(clock.ticks(100.1)) - 100.1) <= 0.5e-3 + 1e-6
+    assert abs(exposure_s(alignment, clock, 100.1) - 100.1) <= 0.5e-3 + 1e-6
     assert alignment.round_trip_s == pytest.approx(1e-3)
 
 
@@ -54,7 +60,7 @@ def test_clock_error_is_small_with_drift_and_jitter(rng: np.random.Generator, pp
         out_s, back_s = 2e-4 + rng.exponential(1e-3, size=2)
         echo(alignment, clock, float(t_s), float(out_s), float(back_s))
         at_s = float(t_s) + 0.2
-        errors_s.append(abs(alignment.to_host_s(clock.ticks(at_s)) - at_s))
+        errors_s.append(abs(exposure_s(alignment, clock, at_s) - at_s))
     assert max(errors_s) < 5e-3
     assert max(errors_s[60:]) < 5e-4  # a line through many echoes has a smaller error than one echo
     assert alignment.drift_ppm == pytest.approx(-ppm, abs=8.0)
@@ -66,7 +72,7 @@ def test_drift_without_jitter_is_tracked() -> None:
     for t_s in np.arange(10.0, 40.0, 0.25):
         echo(alignment, clock, float(t_s), 1e-4, 1e-4)
     assert alignment.drift_ppm == pytest.approx(-30.0, abs=1.0)
-    assert alignment.to_host_s(clock.ticks(50.0)) == pytest.approx(50.0, abs=2e-5)
+    assert exposure_s(alignment, clock, 50.0) == pytest.approx(50.0, abs=2e-5)
 
 
 def test_clock_step_is_accepted_after_three_echoes() -> None:
@@ -75,14 +81,14 @@ def test_clock_step_is_accepted_after_three_echoes() -> None:
         echo(alignment, before, 10.0 + 0.25 * i, 1e-4, 1e-4)
     echo(alignment, after, 20.0, 1e-4, 1e-4)
     assert alignment.is_uncertain
-    assert alignment.to_host_s(before.ticks(20.0)) == pytest.approx(20.0, abs=1e-4)
+    assert exposure_s(alignment, before, 20.0) == pytest.approx(20.0, abs=1e-4)
     echo(alignment, before, 20.1, 1e-4, 1e-4)  # a single deviating echo does not change the alignment
     assert not alignment.is_uncertain
     for i in range(3):
         echo(alignment, after, 21.0 + 0.02 * i, 1e-4, 1e-4)
     assert alignment.resets == 1
     assert not alignment.is_uncertain
-    assert alignment.to_host_s(after.ticks(21.5)) == pytest.approx(21.5, abs=1e-4)
+    assert exposure_s(alignment, after, 21.5) == pytest.approx(21.5, abs=1e-4)
 
 
 def test_impossible_echoes_are_ignored() -> None:
