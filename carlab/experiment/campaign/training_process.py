@@ -64,13 +64,13 @@ def train_in_subprocess(
             "training", train, (plan, models, recordings, envelope), stop, on_report=progress
         )
     except ChildError as error:
-        kept = "; the recordings are kept" if recordings else ""
+        recorded = "; the recordings are kept" if recordings else ""
         if error.end == "died":
             remedy = "Resume the run with --resume." if recordings else "Start the run again."
             raise TrainingDiedError(
-                f"The training process died ({error}; -9 often means too little memory){kept}. {remedy}"
+                f"The training process died ({error}; -9 often means too little memory){recorded}. {remedy}"
             ) from None
-        crash = f"Training failed: {error}{kept}."
+        crash = f"Training failed: {error}{recorded}."
         raise DataError(str(error) if error.end == "failed" else crash) from None
     finally:
         for unfinished in models.glob("*.partial"):
