@@ -210,7 +210,7 @@ def test_error_in_the_training_process_is_reported_in_one_sentence(
         ([], "The training process died (exit code 1; -9 often means too little memory). Start the run again."),
         (
             [Path("0001.mcap")],
-            "The training process died (exit code 1; -9 often means too little memory); the recordings are kept. "
+            "The training process died (exit code 1; -9 often means too little memory); the recordings remain. "
             "Resume the run with --resume.",
         ),
     ],

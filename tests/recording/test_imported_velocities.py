@@ -54,7 +54,7 @@ def test_velocity_column_without_the_other_is_kept_as_extra(tmp_path, present, a
     assert estimated.channel == "vx, vy"
     assert f"vx, vy (the file has no {absent}), by a" in estimated.sentence
     (finding,) = imported.report.of("unused_column")
-    assert "Column 'wheel' is kept as an extra column and not used for the state" in finding.sentence
+    assert "Column 'wheel' stays an extra column and is not used for the state" in finding.sentence
     assert finding.sentence.endswith(f"the file has no {absent}.")
 
 

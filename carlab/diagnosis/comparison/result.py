@@ -44,18 +44,19 @@ class Change:
     @property
     def sentence(self) -> str:
         """The change with its numbers."""
-        parts = []
+        sizes = {}
         for name, e in self.parameters.items():
             unit = f" {unit_text(e.unit)}".rstrip()
             interval = f"{number(e.low90)} to {number(e.high90)} at 90 %"
-            parts.append(f"{name} by {number(e.value)}{unit} ({interval}), from {number(self.reference[name])}{unit}")
-        if self.id not in EFFECTS:  # a base parameter is its only parameter, and its name is written as in the car file
-            subject = parts[0].replace(" by ", " changed by ", 1)
-        else:
-            subject = f"{self.name[0].upper()}{self.name[1:]} changed: {listed(parts)}"
+            sizes[name] = f"by {number(e.value)}{unit} ({interval}), from {number(self.reference[name])}{unit}"
+        if self.id in EFFECTS:
+            parts = listed([f"{name} {size}" for name, size in sizes.items()])
+            text = f"{self.name[0].upper()}{self.name[1:]} changed: {parts}"
+        else:  # a base parameter, with its name as in the car file
+            text = f"{self.id} changed {next(iter(sizes.values()))}"
         others = listed([effect_noun(n) if n in EFFECTS else n for n in self.indistinguishable_from], "or")
         also = f" These recordings do not distinguish it from {others}." if others else ""
-        return f"{subject}.{also}"
+        return f"{text}.{also}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -349,7 +349,7 @@ def _with_smaller_steps(learn: Callable[[float], Learned], what: str) -> Learned
         return learn(SMALLER_STEP_FACTOR)
     except DivergedError as error:
         raise DivergedError(
-            f"The {what} diverged twice, the second time with a smaller learning rate; the recordings are kept. View "
+            f"The {what} diverged twice, the second time with a smaller learning rate; the recordings remain. View "
             "the last recording (carlab replay) and remove it if it is implausible, or start a run with another "
             "--prior."
         ) from error

@@ -64,7 +64,7 @@ def train_in_subprocess(
             "training", train, (plan, models, recordings, envelope), stop, on_report=progress
         )
     except ChildError as error:
-        recorded = "; the recordings are kept" if recordings else ""
+        recorded = "; the recordings remain" if recordings else ""
         if error.end == "died":
             remedy = "Resume the run with --resume." if recordings else "Start the run again."
             raise TrainingDiedError(

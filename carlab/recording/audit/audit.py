@@ -153,7 +153,7 @@ def _estimated_velocities(
     if unused and mapping.velocities == "columns":
         absent = "vy" if unused[0] == "vx" else "vx"
         sentence = (
-            f"Column '{mapping.columns[unused[0]].name}' is kept as an extra column and not used for the state: vx and "
+            f"Column '{mapping.columns[unused[0]].name}' stays an extra column and is not used for the state: vx and "
             f"vy are taken together, and the file has no {absent}."
         )
         findings.append(Finding("unused_column", unused[0], Severity.WARNING, sentence))

@@ -357,7 +357,7 @@ def check_reference(t_s: FloatArray, name: str, column: FloatArray, channel: str
         lag = f"{fit.lag_s * 1e3:.0f} ms later" if is_inside else "at a lag that this drive does not show"
         sentence = (
             f"'{name}' is {fit.scale:.2f} times the {channel} of the pose, {lag} (correlation {agreement:.2f}); it is "
-            "kept as an extra column and not used for the state."
+            "an extra column and not used for the state."
         )
         evidence = {"scale": fit.scale, "correlation": agreement} | ({"lag_s": fit.lag_s} if is_inside else {})
         findings.append(Finding("reference_column", channel, Severity.INFO, sentence, evidence=evidence))
