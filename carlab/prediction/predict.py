@@ -16,6 +16,7 @@ import torch
 
 from carlab.core.planar import arc
 from carlab.core.quantities import FloatArray
+from carlab.prediction.step_length import step_for
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.inputs import with_effects_of_values
@@ -31,8 +32,6 @@ from sim_backends.measurement import (
 )
 from sim_backends.measurement import velocity_curvature as state_curvature
 
-MAX_STEP_S = 0.017
-"""Maximum integration step: at 30 Hz its error is below a hundredth of a noise floor."""
 MAX_SINGLE_POSE = 100.0
 """Maximum coordinate of a pose [m, rad] that is simulated with 32 bits; each step rounds it by at most 4e-6. Surveyed
 coordinates of 5e6 m would be rounded to 0.5 m."""
@@ -106,7 +105,7 @@ def simulate_windows(
     config: SimulatorConfig,
     values: Mapping[str, FloatArray] | None = None,
     *,
-    max_step_s: float = MAX_STEP_S,
+    max_step_s: float | None = None,
     ticks: IndexArray | None = None,
     in_double: bool = False,
     engine: Engine = "fastest",
@@ -118,7 +117,7 @@ def simulate_windows(
         config: the simulator, observation effects included.
         values: parameters by dotted name, each (P,), or (P, S) for a value of each window; default: those of
             ``config``.
-        max_step_s: maximum integration step.
+        max_step_s: maximum integration step; by default as long as the cars of the windows allow.
         ticks: indices (U,) of the ticks to return; all K + 1 by default.
         in_double: simulate with 64 instead of 32 bits, which takes twice as long; always done where 32 are not enough.
         engine: of the rollouts.
@@ -126,13 +125,10 @@ def simulate_windows(
     Returns:
         Predicted measurements (P, S, K + 1 or U, 6) in the order and units of ``PredictiveModel``.
     """
-    given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in (values or {}).items()}
-    sets = max((len(v) for v in given.values()), default=1)
-    whole = with_effects_of_values(config, given)
-    numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
-    shaped = {name: _by_set(value, sets) for name, value in numbers.items()}
+    whole, shaped = _by_set(config, values or {})
+    sets = len(shaped["vehicle.mass"])
     measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
-    inner = {n: shaped[n] for n in given if not is_measurement_parameter(n)}
+    inner = {n: shaped[n] for n in values or {} if not is_measurement_parameter(n)}
     effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
     delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
     inner[COMMAND_DELAY] = np.asarray(delay_s)
@@ -152,13 +148,21 @@ def simulate_windows(
         history_states=None if earlier is None else tensor(earlier),
         values={name: tensor(np.broadcast_to(v, (sets, count)).reshape(-1)) for name, v in inner.items()},
         t0_s=tensor(np.tile(windows.t0_s, sets)),
-        max_step_s=max_step_s,
+        max_step_s=longest_step_s(windows, config, values) if max_step_s is None else max_step_s,
         engine=engine,
     ).states
     rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
     rows = rows.reshape(windows.steps + 1, 6, sets, count) + np.moveaxis(origin, -1, 0)
     trajectory: list[State] = [tuple(tick) for tick in rows]
     return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
+
+
+def longest_step_s(
+    windows: PredictionWindows, config: SimulatorConfig, values: Mapping[str, FloatArray] | None = None
+) -> float:
+    """Longest accurate integration step [s] of ``simulate_windows`` with the same arguments."""
+    whole, shaped = _by_set(config, values or {})
+    return step_for(windows, whole.kind, shaped, whole.effects)
 
 
 def _tensor(array: FloatArray, dtype: type[np.floating[Any]]) -> torch.Tensor:
@@ -220,7 +224,16 @@ def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:
     return second
 
 
-def _by_set(value: float | FloatArray, sets: int) -> FloatArray:
+def _by_set(config: SimulatorConfig, values: Mapping[str, FloatArray]) -> tuple[SimulatorConfig, dict[str, FloatArray]]:
+    """The simulator with the effects of ``values``, and all its parameters, each (P, 1) or (P, S)."""
+    given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in values.items()}
+    sets = max((len(v) for v in given.values()), default=1)
+    whole = with_effects_of_values(config, given)
+    numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
+    return whole, {name: _in_columns(value, sets) for name, value in numbers.items()}
+
+
+def _in_columns(value: float | FloatArray, sets: int) -> FloatArray:
     """A number, (P,) or (P, S) as an array (P, 1) or (P, S)."""
     array = np.asarray(value, dtype=np.float64)
     return array if array.ndim == 2 else np.broadcast_to(array.reshape(-1, 1), (sets, 1)).copy()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.predict import longest_step_s, simulate_windows
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.array_ops import ARRAYS, Value
 from sim_backends.batch.rollout import CARS_AT_ONCE
@@ -75,9 +75,10 @@ def knots_in_use(
         ]
         used[curve.id] |= by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] & by_axis[1][None]
 
+    step_s = longest_step_s(windows, config, values)
     ignored = np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a diverged simulation
     with ignored, report_evaluations(mark):
-        simulate_windows(windows, config, values, engine="operators")
+        simulate_windows(windows, config, values, max_step_s=step_s, engine="operators")
     return used
 
 

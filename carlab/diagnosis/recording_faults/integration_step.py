@@ -1,29 +1,28 @@
-"""Check of the integration step: the nominal simulator at its step and at a quarter of it."""
+"""Check of the integration step: the nominal simulator at its usual and at a fine step."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.quantities import STATE_NAMES
 from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
-from carlab.prediction.predict import MAX_STEP_S
-from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
-from sim_backends.batch.rollout import rollout
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.step_length import MIN_STEP_S
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 
 MAX_WINDOWS = 64
 HORIZON_S = 1.0
+FINE_STEP_S = MIN_STEP_S / 4.0
 
 
 def check_integration(fit: Sequence[EpisodeData], nominal: SimulatorConfig) -> list[DataFault]:
-    """Compare the difference of predictions at their usual step and at a quarter of it with the noise, by channel.
+    """Compare the difference of predictions at their usual step and at ``FINE_STEP_S`` with the noise, by channel.
 
     The difference is the root mean square after 1 s without the tenth of the windows with the largest differences,
     because a spinning car amplifies all errors. Returns an empty list without windows.
@@ -38,7 +37,8 @@ def check_integration(fit: Sequence[EpisodeData], nominal: SimulatorConfig) -> l
     windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, MAX_WINDOWS).round().astype(np.int64)))
     noise = estimate_noise(segments, windows.curvature_bias).measured
     with np.errstate(all="ignore"):  # a step that is far too coarse overflows
-        difference = np.abs(_ends(windows, nominal, MAX_STEP_S) - _ends(windows, nominal, 0.25 * MAX_STEP_S))
+        usual, fine = (simulate_windows(windows, nominal, max_step_s=s, in_double=True) for s in (None, FINE_STEP_S))
+        difference = np.abs(usual - fine)[0, :, -1]
     difference = np.where(np.isfinite(difference), difference, np.inf)
     difference_rms = np.sqrt(np.mean(np.sort(difference, axis=0)[: max(round(0.9 * len(windows)), 1)] ** 2, axis=0))
     return [
@@ -52,18 +52,3 @@ def check_integration(fit: Sequence[EpisodeData], nominal: SimulatorConfig) -> l
         for name, size, own in zip(STATE_NAMES, difference_rms, noise, strict=True)
         if size > own
     ]
-
-
-def _ends(windows: PredictionWindows, nominal: SimulatorConfig, max_step_s: float) -> FloatArray:
-    def tensor(values: FloatArray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
-
-    states = rollout(
-        replace(nominal, control_period_s=windows.period_s, priors={}, parameter_std={}),
-        tensor(windows.initial_states),
-        tensor(windows.commands),
-        history=tensor(windows.past_commands),
-        t0_s=tensor(windows.t0_s),
-        max_step_s=max_step_s,
-    ).states
-    return np.asarray(states[:, -1].numpy(), dtype=np.float64)
