@@ -45,7 +45,8 @@ class CanLink:
     """Frame link on a CAN bus: a frame is sent at once or an ActuatorFaultError is raised.
 
     A frame that the controller cannot send now must not be sent later. Each send has a time-out of zero; after an
-    error the device closes the link, which drops the frames in the adapter's queue, and opens it again.
+    error the device closes the link, which drops the frames in the adapter's queue, and opens it again. An interface of
+    python-can raises the errors of its own library too; each of them is a failure of the bus.
 
     With a ``controller_id``, the open link holds the lock on this controller (``drivers.links.bus_lock``).
     """
@@ -83,9 +84,10 @@ class CanLink:
     def write(self, frame: CanFrame) -> None:
         """Send a data frame with a 29-bit identifier. Raises ActuatorFaultError if the bus does not accept it."""
         message = can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=True)
+        bus = self._opened()
         try:
-            self._opened().send(message, timeout=0)
-        except (can.CanError, OSError) as error:
+            bus.send(message, timeout=0)
+        except Exception as error:
             self._flush()
             raise self._failed(error) from error
 
@@ -96,7 +98,7 @@ class CanLink:
         for _ in range(MAX_FRAMES_PER_READ):
             try:
                 message = bus.recv(0)
-            except (can.CanError, OSError, ValueError) as error:
+            except Exception as error:
                 raise self._failed(error) from error
             if message is None:
                 break
@@ -118,7 +120,8 @@ class CanLink:
         bus, self._bus, self._descriptor = self._bus, None, None
         try:
             if bus is not None:
-                bus.shutdown()
+                with contextlib.suppress(Exception):  # the adapter was removed
+                    bus.shutdown()
         finally:
             self._unlock()
 
@@ -137,7 +140,7 @@ class CanLink:
     def _flush(self) -> None:
         if self._bus is None:
             return
-        with contextlib.suppress(NotImplementedError, can.CanError, OSError):  # no queue, or the adapter was removed
+        with contextlib.suppress(Exception):  # no queue, or the adapter was removed
             self._bus.flush_tx_buffer()
 
     def _failed(self, error: object) -> ActuatorFaultError:

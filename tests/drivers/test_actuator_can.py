@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import subprocess
@@ -14,9 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import can
 import pytest
-from can.interfaces.virtual import VirtualBus
 from faulty_frame_link import FaultyFrameLink
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
@@ -32,7 +29,6 @@ from drivers.links.can_link import CanLink
 from drivers.links.link import CanFrame
 from drivers.sender.logic import SenderState
 from drivers.sender.process import SenderThread
-from drivers.vesc import can_codec as vesc_can_codec
 from drivers.vesc.can_device import VescCanDevice
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -182,74 +178,6 @@ def test_bus_failure_latches_a_fault_and_the_firmware_times_out() -> None:
                 actuator.arm()
             actuator.reset_fault()
             actuator.arm()
-
-
-class BrokenBus(VirtualBus):
-    """A virtual bus with the failures of a real bus."""
-
-    failure: Exception | None = None
-    received: can.Message | None = None
-    flushed = 0
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        assert timeout == 0, "a frame that cannot be sent now must not be sent later"
-        if self.failure is not None:
-            raise self.failure
-        super().send(msg, timeout)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        if self.failure is not None and self.received is None:
-            raise self.failure
-        message, self.received = self.received, None
-        return message
-
-    def flush_tx_buffer(self) -> None:
-        self.flushed += 1
-
-
-class BrokenLink(CanLink):
-    """A CAN link on a ``BrokenBus``."""
-
-    bus: BrokenBus
-
-    def _open_bus(self) -> can.BusABC:
-        self.bus = BrokenBus(channel=self.channel)
-        return self.bus
-
-
-@pytest.mark.parametrize(
-    "failure",
-    [
-        can.CanOperationError("transmit buffer full"),
-        OSError(errno.ENOBUFS, "no buffer space"),
-        OSError(errno.ENETDOWN, "network is down"),
-    ],
-)
-def test_bus_errors_raise_faults_and_flush_the_queue(failure: Exception) -> None:
-    link = BrokenLink("virtual", channel_name())
-    link.open()
-    link.bus.failure = failure
-    with pytest.raises(ActuatorFaultError, match="check wiring"):
-        link.write(vesc_can_codec.set_current(23, 1.0))
-    assert link.bus.flushed == 1
-    with pytest.raises(ActuatorFaultError):
-        link.read()
-    link.close()
-    link.close()
-    with pytest.raises(ActuatorFaultError, match="not open"):
-        link.read()
-
-
-def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
-    link = BrokenLink("virtual", channel_name())
-    link.open()
-    link.bus.received = can.Message(arbitration_id=0x04, is_error_frame=True, data=bytes(8))
-    assert link.read() == []
-    assert link.statistics.error_frames == 1
-    link.bus.received = can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
-    with pytest.raises(ActuatorFaultError, match="bus-off"):
-        link.read()
-    link.close()
 
 
 @pytest.mark.parametrize("victim", ["main", "sender"])

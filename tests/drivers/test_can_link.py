@@ -1,0 +1,98 @@
+"""The CAN link on buses of python-can: failures and error frames."""
+
+from __future__ import annotations
+
+import errno
+import uuid
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+
+from carlab.core.errors import ActuatorFaultError
+from drivers.links.can_link import CanLink
+from drivers.vesc import can_codec as vesc_can_codec
+
+
+class BrokenBus(VirtualBus):
+    """A virtual bus with the failures of a real bus."""
+
+    failure: Exception | None = None
+    received: can.Message | None = None
+    shutdown_failure: Exception | None = None
+    flushed = 0
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        assert timeout == 0, "a frame that cannot be sent now must not be sent later"
+        if self.failure is not None:
+            raise self.failure
+        super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self.failure is not None and self.received is None:
+            raise self.failure
+        message, self.received = self.received, None
+        return message
+
+    def flush_tx_buffer(self) -> None:
+        self.flushed += 1
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        if self.shutdown_failure is not None:
+            raise self.shutdown_failure
+
+
+class BrokenLink(CanLink):
+    """A CAN link on a ``BrokenBus``."""
+
+    bus: BrokenBus
+
+    def _open_bus(self) -> can.BusABC:
+        self.bus = BrokenBus(channel=self.channel)
+        return self.bus
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        can.CanOperationError("transmit buffer full"),
+        OSError(errno.ENOBUFS, "no buffer space"),
+        OSError(errno.ENETDOWN, "network is down"),
+        IndexError("an interface reads a line that is no frame"),
+    ],
+)
+def test_bus_errors_raise_faults_and_flush_the_queue(failure: Exception) -> None:
+    link = BrokenLink("virtual", f"test-{uuid.uuid4()}")
+    link.open()
+    link.bus.failure = failure
+    with pytest.raises(ActuatorFaultError, match="check wiring"):
+        link.write(vesc_can_codec.set_current(23, 1.0))
+    assert link.bus.flushed == 1
+    with pytest.raises(ActuatorFaultError):
+        link.read()
+    link.close()
+    link.close()
+    with pytest.raises(ActuatorFaultError, match="not open"):
+        link.read()
+
+
+def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
+    link = BrokenLink("virtual", f"test-{uuid.uuid4()}")
+    link.open()
+    link.bus.received = can.Message(arbitration_id=0x04, is_error_frame=True, data=bytes(8))
+    assert link.read() == []
+    assert link.statistics.error_frames == 1
+    link.bus.received = can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
+    with pytest.raises(ActuatorFaultError, match="bus-off"):
+        link.read()
+    link.close()
+
+
+def test_adapter_that_cannot_be_shut_down_is_closed() -> None:
+    link = BrokenLink("virtual", f"test-{uuid.uuid4()}")
+    link.open()
+    link.bus.shutdown_failure = can.CanOperationError("the adapter was removed")
+    link.close()
+    link.open()
+    link.close()
