@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import select
 from pathlib import Path
 from typing import Final
 
@@ -97,7 +98,7 @@ class CanLink:
         frames: list[CanFrame] = []
         for _ in range(MAX_FRAMES_PER_READ):
             try:
-                message = bus.recv(0)
+                message = bus.recv(0) if self._has_input() else None
             except Exception as error:
                 raise self._failed(error) from error
             if message is None:
@@ -136,6 +137,10 @@ class CanLink:
         if self._bus is None:
             raise ActuatorFaultError(f"CAN bus {self.interface} {self.channel} is not open; open the car first.")
         return self._bus
+
+    def _has_input(self) -> bool:
+        """Whether ``recv`` returns at once: without input it waits as long as a backward step of the system clock."""
+        return self._descriptor is None or bool(select.select([self._descriptor], [], [], 0.0)[0])
 
     def _flush(self) -> None:
         if self._bus is None:

@@ -1,8 +1,9 @@
-"""The CAN link on buses of python-can: failures and error frames."""
+"""The CAN link on buses of python-can: failures, error frames, steps of the system clock."""
 
 from __future__ import annotations
 
 import errno
+import time
 import uuid
 
 import can
@@ -95,4 +96,16 @@ def test_adapter_that_cannot_be_shut_down_is_closed() -> None:
     link.bus.shutdown_failure = can.CanOperationError("the adapter was removed")
     link.close()
     link.open()
+    link.close()
+
+
+def test_reading_does_not_wait_after_a_backward_step_of_the_system_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """python-can measures the time-out of a read with the system clock."""
+    clock_s = iter((1000.0, 990.0, 2000.0))
+    link = CanLink("udp_multicast", f"239.74.163.2:{20000 + uuid.uuid4().int % 20000}")
+    link.open()
+    monkeypatch.setattr("can.bus.time", lambda: next(clock_s))
+    started_s = time.monotonic()
+    assert link.read() == []
+    assert time.monotonic() - started_s < 5.0
     link.close()
