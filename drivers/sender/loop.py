@@ -5,6 +5,7 @@ It runs in a separate process without other threads (``process``); for a bus wit
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import socket
@@ -17,7 +18,7 @@ from carlab.core.errors import ActuatorFaultError, NotReadyError
 from drivers.calibration import ActuatorCalibration, DeviceCommand
 from drivers.config import ActuatorConfig
 from drivers.device import Device, FirmwareIdentity
-from drivers.sender.logic import Order, SenderLogic, SenderState
+from drivers.sender.logic import NEUTRAL_FRAMES, NEUTRAL_SPAN_S, Order, SenderLogic, SenderState
 from drivers.sender.slots import Slot
 from drivers.sender.status import SenderStatus
 
@@ -72,10 +73,14 @@ class SenderLoop:
         self._needs_version = False
 
     def run(self) -> None:
-        """Connect and send until shutdown; always closes the device and publishes a last status."""
+        """Connect and send until shutdown; always closes the device and publishes a last status.
+
+        After an unexpected error it sends neutral first.
+        """
         try:
             self._run()
         except Exception as error:
+            self._send_last_neutral()
             self.logic.link_failed(
                 f"the sender failed ({type(error).__name__}: {error}); close the car and open it again."
             )
@@ -104,6 +109,13 @@ class SenderLoop:
                 missed = max(0, int((now_s - deadline_s) / self._period_s))
                 self._skipped += missed
                 deadline_s += (missed + 1) * self._period_s
+
+    def _send_last_neutral(self) -> None:
+        """Write neutral three times over 60 ms, if the link is open and the firmware known; ignores errors."""
+        for _ in range(NEUTRAL_FRAMES if self._is_link_open and self.logic.is_ready_to_send else 0):
+            with contextlib.suppress(Exception):
+                self.device.send(self.logic.neutral)
+            time.sleep(NEUTRAL_SPAN_S / (NEUTRAL_FRAMES - 1))
 
     def _wait(self, deadline_s: float) -> bool:
         """Wait for the deadline (True) or for an order that may be sent earlier (False); reads replies meanwhile."""

@@ -53,6 +53,9 @@ class FakeTime:
     def monotonic(self) -> float:
         return self.now_s
 
+    def sleep(self, duration_s: float) -> None:
+        self.now_s += duration_s
+
 
 class Bench:
     """An armed sender with one fresh moving command."""
@@ -167,6 +170,21 @@ def test_only_written_neutral_frames_count_before_the_sender_ends(bench: Bench) 
         bench.loop._tick(bench.time.now_s)
     assert len(bench.device.written) >= 3
     assert set(bench.device.written) == {CALIBRATION.neutral}
+
+
+def test_unexpected_error_ends_the_sender_with_neutral(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(now_s: float) -> list[object]:
+        raise KeyError("an error in the program")
+
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == MOVING
+    monkeypatch.setattr(bench.device, "receive", fail)
+    started_s = bench.time.now_s
+    with pytest.raises(KeyError):
+        bench.loop.run()
+    assert bench.device.written[-3:] == [CALIBRATION.neutral] * 3
+    assert bench.time.now_s - started_s >= 0.06
+    assert bench.loop.logic.state == SenderState.FAULT
 
 
 def test_command_replaced_by_neutral_is_not_reported_as_sent(bench: Bench) -> None:
