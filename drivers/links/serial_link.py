@@ -30,12 +30,18 @@ def serial_ports() -> list[str]:
 
 
 class SerialLink:
-    """A serial port opened exclusively, with non-blocking reads and a time-out on writes."""
+    """A serial port opened exclusively, with non-blocking reads and a time-out on writes.
 
-    def __init__(self, port: str, baud: int = 115200, write_timeout_s: float = WRITE_TIMEOUT_S) -> None:
+    ``setting`` is the name of the port in ``[hardware.actuator]``, for messages.
+    """
+
+    def __init__(
+        self, port: str, baud: int = 115200, write_timeout_s: float = WRITE_TIMEOUT_S, *, setting: str = "port"
+    ) -> None:
         self.port = port
         self.baud = baud
         self.write_timeout_s = write_timeout_s
+        self.setting = setting
         self.statistics = LinkStatistics()
         self._serial: serial.Serial | None = None
 
@@ -129,9 +135,9 @@ class SerialLink:
         if not os.path.exists(self.port):
             found = serial_ports()
             there = f"the available ports are {', '.join(found)}" if found else "there is no serial port"
-            return f"it does not exist; {there}. Plug the motor controller in and set 'port' in [hardware.actuator]."
+            return f"it does not exist; {there}. Plug the device in and set '{self.setting}' in [hardware.actuator]."
         if (isinstance(error, OSError) and error.errno == errno.EACCES) or "Permission" in str(error):
             return "permission is denied; add yourself to its group (often 'dialout') and log in again."
         if "exclusively lock" in str(error) or "Resource temporarily unavailable" in str(error):
             return "another program uses it; close that program."
-        return f"{error}. Check that 'port' in [hardware.actuator] names the motor controller."
+        return f"{error}. Check that '{self.setting}' in [hardware.actuator] names the device."

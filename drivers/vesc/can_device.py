@@ -7,6 +7,7 @@ from drivers.config import ActuatorConfig
 from drivers.device import DeviceCounters, Reply
 from drivers.links.can_link import CanLink
 from drivers.links.link import CanFrame, FrameLink
+from drivers.links.slcan_link import SlcanLink
 from drivers.vesc import can_codec as vesc_can_codec
 from drivers.vesc import payloads as vesc_payloads
 from drivers.vesc.can_codec import CanReassembler, ReplyMode
@@ -82,5 +83,9 @@ class VescCanDevice:
 
 def make_device(config: ActuatorConfig) -> VescCanDevice:
     """Create the VESC of a configuration without opening its bus."""
-    link = CanLink(config.interface, config.channel, config.bitrate, config.controller_id)
+    link: FrameLink
+    if config.interface == "slcan":
+        link = SlcanLink(config.channel, config.bitrate)
+    else:
+        link = CanLink(config.interface, config.channel, config.bitrate, config.controller_id)
     return VescCanDevice(link, config.controller_id, config.host_id)

@@ -1,0 +1,141 @@
+"""A CAN bus behind a serial adapter: driving, noise, an adapter that hangs or is removed."""
+
+from __future__ import annotations
+
+import os
+import time
+import tty
+import uuid
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from slcan_adapter import SlcanAdapter
+
+from carlab.core.errors import ActuatorFaultError, NotReadyError
+from carlab.core.quantities import Action
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.emulators.can_firmware import CanFirmware
+from drivers.emulators.command_log import CommandLog
+from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.links import slcan_link
+from drivers.links.link import CanFrame
+from drivers.links.slcan_link import SlcanLink, decode_line
+from drivers.sender.logic import SenderState
+
+MOVING = Action(0.5, 0.3)
+TIMEOUT_S = 20.0
+
+
+def config_for(adapter: SlcanAdapter, **changes: Any) -> ActuatorConfig:
+    common = {"watchdog_s": 2.0, "latch_s": 30.0, "telemetry_stale_s": 5.0, "telemetry_lost_s": 10.0}
+    return ActuatorConfig(kind="vesc_can", interface="slcan", channel=adapter.port, **(common | changes))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < end_s, "the condition was not met in time"
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def channel() -> str:
+    return f"test-{uuid.uuid4()}"
+
+
+@pytest.fixture
+def adapter(channel: str) -> Iterator[SlcanAdapter]:
+    with SlcanAdapter(channel) as served:
+        yield served
+
+
+@pytest.fixture
+def firmware(channel: str) -> Iterator[CanFirmware]:
+    with CanFirmware(VescFirmware(CommandLog(), motor_timeout_s=0.4), "virtual", channel) as served:
+        yield served
+
+
+def test_drive_survives_noise_and_ends_in_neutral(adapter: SlcanAdapter, firmware: CanFirmware) -> None:
+    with Actuator(config_for(adapter), ActuatorCalibration()) as actuator:
+        assert adapter.lines[:4] == [b"", b"C", b"S6", b"O"]
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in firmware.log.motor()))
+        for noise in (b"D0123\r", b"t12\r", b"\xff\xfe\r", b"T000009179\r", b"\a", b"x" * 100):
+            adapter.send(noise)
+        t_noise_s = time.monotonic()
+        until(lambda: actuator.status().t_telemetry_s > t_noise_s + 0.1)
+        assert actuator.status().state == SenderState.ARMED
+        actuator.stop(planned=True)
+    until(lambda: adapter.lines[-1] == b"C")
+    assert firmware.log.motor()[-1].value == 0.0
+
+
+def test_removed_adapter_latches_a_fault(adapter: SlcanAdapter, firmware: CanFirmware) -> None:
+    with Actuator(config_for(adapter), ActuatorCalibration()) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in firmware.log.motor()))
+        adapter.unplug()
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        assert "was lost" in actuator.status().fault
+        assert not actuator.status().is_ended
+
+
+def test_adapter_that_does_not_read_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its buffer fills up; unsent commands are discarded."""
+    monkeypatch.setattr(slcan_link, "BOOT_S", 0.0)
+    master, terminal = os.openpty()
+    tty.setraw(terminal)
+    link = SlcanLink(os.ttyname(terminal))
+    link.open()
+
+    def write_until_full() -> None:
+        for _ in range(10_000):
+            link.write(CanFrame(0x117, bytes(4)))
+
+    with pytest.raises(ActuatorFaultError, match="accepts no more bytes"):
+        write_until_full()
+    link.close()
+    os.close(master)
+    os.close(terminal)
+
+
+def test_port_in_use_and_unknown_bitrate_are_refused(monkeypatch: pytest.MonkeyPatch, adapter: SlcanAdapter) -> None:
+    monkeypatch.setattr(slcan_link, "BOOT_S", 0.0)
+    link = SlcanLink(adapter.port)
+    link.open()
+    with pytest.raises(NotReadyError, match="another program uses it"):
+        SlcanLink(adapter.port).open()
+    link.close()
+    with pytest.raises(NotReadyError, match="bitrate 33333 is not one of"):
+        SlcanLink(adapter.port, 33_333).open()
+    with pytest.raises(NotReadyError, match="set 'channel'"):
+        SlcanLink("/dev/does_not_exist").open()
+
+
+@pytest.mark.parametrize(
+    ("line", "frame"),
+    [
+        (b"T00000901200ff", CanFrame(0x901, b"\x00\xff")),
+        (b"T00000901200FF1234", CanFrame(0x901, b"\x00\xff")),  # with a time stamp
+        (b"T1FFFFFFF0", CanFrame(0x1FFFFFFF, b"")),
+        (b"T3FFFFFFF0", None),
+        (b"T000009012FF", None),
+        (b"t90120000", None),
+        (b"", None),
+    ],
+)
+def test_lines_are_decoded(line: bytes, frame: CanFrame | None) -> None:
+    assert decode_line(line) == frame
+
+
+@given(st.binary(max_size=40))
+def test_random_lines_are_decoded_or_ignored(line: bytes) -> None:
+    decode_line(line)
+    decode_line(b"T" + line)

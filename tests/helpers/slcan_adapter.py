@@ -1,0 +1,68 @@
+"""An emulated slcan adapter: a pseudo-terminal in front of a ``virtual`` CAN bus of python-can."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import tty
+from typing import Self
+
+import can
+
+
+class SlcanAdapter:
+    """It forwards frames in both directions and acknowledges each line, like the firmware of such adapters."""
+
+    def __init__(self, channel: str) -> None:
+        self.reads = True
+        self.lines: list[bytes] = []
+        self._bus = can.Bus(channel, interface="virtual", ignore_config=True)
+        self._master, terminal = os.openpty()
+        tty.setraw(terminal)
+        self.port = os.ttyname(terminal)
+        self._terminal: int | None = terminal
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+
+    def send(self, data: bytes) -> None:
+        """Send raw bytes to the host."""
+        os.write(self._master, data)
+
+    def unplug(self) -> None:
+        """End the adapter and remove its port."""
+        if self._terminal is None:
+            return
+        self._stop.set()
+        self._thread.join()
+        os.close(self._master)
+        os.close(self._terminal)
+        self._terminal = None
+        self._bus.shutdown()
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.unplug()
+
+    def _serve(self) -> None:
+        pending = b""
+        while not self._stop.is_set():
+            if self.reads and select.select([self._master], [], [], 0.002)[0]:
+                *lines, pending = (pending + os.read(self._master, 4096)).split(b"\r")
+                for line in lines:
+                    self._execute(line)
+            message = self._bus.recv(0.001)
+            if message is not None:
+                self.send(f"T{message.arbitration_id:08X}{message.dlc}{message.data.hex().upper()}\r".encode())
+
+    def _execute(self, line: bytes) -> None:
+        self.lines.append(line)
+        if line.startswith(b"T"):
+            data = bytes.fromhex(line[10:].decode())
+            self._bus.send(can.Message(arbitration_id=int(line[1:9], 16), data=data, is_extended_id=True))
+            self.send(b"Z\r")
+        else:
+            self.send(b"\r")
