@@ -52,6 +52,8 @@ class Packet(enum.IntEnum):
 
 
 STATUS_PACKETS = frozenset(p for p in Packet if p.name.startswith("STATUS"))
+MOTOR_PACKETS = frozenset((0, 1, 2, 3, 4, 10, 11, 12, 13))
+"""Every packet that commands the motor: duty, current, brake current, speed, position, and relative ones."""
 
 
 class ReplyMode(enum.IntEnum):

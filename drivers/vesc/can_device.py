@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from carlab.core.errors import ActuatorFaultError
 from drivers.calibration import DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.device import DeviceCounters, Reply
@@ -16,12 +17,17 @@ from drivers.vesc.reply_reader import ReplyReader
 
 
 class VescCanDevice:
-    """A VESC on a CAN bus: simple commands, short buffers, status broadcasts and polled telemetry."""
+    """A VESC on a CAN bus: simple commands, short buffers, status broadcasts and polled telemetry.
 
-    def __init__(self, link: FrameLink, controller_id: int, host_id: int) -> None:
+    A motor command of another sender on the bus raises ActuatorFaultError. ``has_echo``: the link also receives the
+    frames that it sends, so other senders cannot be detected.
+    """
+
+    def __init__(self, link: FrameLink, controller_id: int, host_id: int, *, has_echo: bool = False) -> None:
         self.link = link
         self.controller_id = controller_id
         self.host_id = host_id
+        self.has_echo = has_echo
         self._reassembler = CanReassembler(host_id)
         self._replies = ReplyReader()
 
@@ -72,6 +78,11 @@ class VescCanDevice:
             self.link.write(frame)
 
     def _decode(self, frame: CanFrame) -> FirmwareVersion | MotorValues | None:
+        if not self.has_echo and self._commands_the_motor(frame):
+            raise ActuatorFaultError(
+                f"another sender on the CAN bus commands controller {self.controller_id}; end that program, or switch "
+                "off 'Multiple VESCs over CAN' in the other motor controller, then reset the fault."
+            )
         is_ours = vesc_can_codec.controller_of(frame) == self.controller_id
         if is_ours and (values := vesc_can_codec.decode_status(frame)) is not None:
             return values
@@ -79,6 +90,10 @@ class VescCanDevice:
         if packet is None or packet.send != ReplyMode.IS_REPLY or packet.sender_id != self.controller_id:
             return None
         return vesc_payloads.decode_reply(packet.payload)
+
+    def _commands_the_motor(self, frame: CanFrame) -> bool:
+        is_addressed = vesc_can_codec.controller_of(frame) in (self.controller_id, vesc_can_codec.BROADCAST_ID)
+        return is_addressed and vesc_can_codec.packet_of(frame) in vesc_can_codec.MOTOR_PACKETS
 
 
 def make_device(config: ActuatorConfig) -> VescCanDevice:
@@ -88,4 +103,5 @@ def make_device(config: ActuatorConfig) -> VescCanDevice:
         link = SlcanLink(config.channel, config.bitrate)
     else:
         link = CanLink(config.interface, config.channel, config.bitrate, config.controller_id)
-    return VescCanDevice(link, config.controller_id, config.host_id)
+    has_echo = config.interface == "udp_multicast"
+    return VescCanDevice(link, config.controller_id, config.host_id, has_echo=has_echo)

@@ -120,6 +120,27 @@ def test_broadcasts_of_a_controller_that_does_not_answer_are_no_telemetry(monkey
         assert "the VESC stopped answering" in actuator.status().fault
 
 
+@pytest.mark.parametrize("identifier", [0x117, 0x2FF])
+def test_motor_command_of_another_sender_latches_a_fault(identifier: int) -> None:
+    """Two senders would alternate; a broadcast commands each controller."""
+    channel = channel_name()
+    other = CanLink("virtual", channel)
+    served = CanFirmware(VescFirmware(CommandLog()), "virtual", channel)
+    with served, Actuator(config_for("virtual", channel), CALIBRATION) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in served.log.motor()))
+        other.open()
+        other.write(CanFrame(0x118, bytes(4)))  # another controller
+        other.write(CanFrame(identifier, bytes(4)))
+        other.close()
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        assert "another sender on the CAN bus commands controller 23" in actuator.status().fault
+        until(lambda: actuator.status().t_telemetry_s > 0.0)
+        actuator.reset_fault()
+        actuator.arm()
+
+
 def test_driving_continues_despite_lost_frames() -> None:
     channel = channel_name()
     faults = WireFaults(drop_share=0.1, corrupt_share=0.1, seed=1)
