@@ -295,7 +295,6 @@ def _known(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
-def parent_watch() -> Callable[[], bool]:
-    """Return a check that the parent process still runs (a forked sibling may hold the pipe open)."""
-    parent = os.getppid()
+def parent_watch(parent: int) -> Callable[[], bool]:
+    """Return a check that the process ``parent`` still runs (a forked sibling may hold the wake line open)."""
     return lambda: os.getppid() == parent

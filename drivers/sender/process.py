@@ -114,7 +114,7 @@ class SenderProcess:
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
         return subprocess.Popen(
-            [sys.executable, "-P", "-m", "drivers.sender.process", *map(str, descriptors), settings],
+            [sys.executable, "-P", "-m", "drivers.sender.process", *map(str, descriptors), settings, str(os.getpid())],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             pass_fds=descriptors,
@@ -210,10 +210,13 @@ def _try_realtime() -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the sender's process. Arguments: descriptors of orders, statuses and wake line, then settings as JSON."""
+    """Run the sender's process.
+
+    Arguments: descriptors of orders, statuses and wake line, settings as JSON, process id of the main process.
+    """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    is_main_alive = parent_watch()
+    is_main_alive = parent_watch(int(arguments[4]))
     orders_fd, statuses_fd, wake_fd = (int(a) for a in arguments[:3])
     settings = json.loads(arguments[3])
     DEVICE_KINDS[settings["actuator"]["kind"]] = DeviceKind(**settings["device_kind"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -99,6 +100,22 @@ def main():
                     report("refused", type(retry_error).__name__)
 
 main()
+"""
+
+
+FORK_AND_DIE = """
+import os, sys, time
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.sender.process import SenderProcess
+
+sender = SenderProcess(ActuatorConfig(port=sys.argv[1]), ActuatorCalibration())
+worker = os.fork()
+if worker == 0:
+    time.sleep(60.0)
+    os._exit(0)
+print(sender.pid, worker, flush=True)
+os.kill(os.getpid(), 9)
 """
 
 
@@ -270,3 +287,18 @@ def test_sender_whose_wake_line_closes_sends_neutral_and_ends(firmware: SerialFi
         sender.close()
         assert sender._process.returncode == 0, "the sender ended by itself"
         assert firmware.log.wait_for("hang_up", TIMEOUT_S) is not None
+
+
+def test_sender_ends_if_the_main_process_dies_while_it_starts(firmware: SerialFirmware) -> None:
+    """A forked worker holds the wake line open, and the sender has another parent before its first check."""
+    with firmware:
+        command = [sys.executable, "-c", FORK_AND_DIE, firmware.port]
+        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            sender, worker = map(int, process.stdout.readline().split())
+            try:
+                wait_for(lambda: not Path(f"/proc/{sender}").exists())
+            finally:
+                for pid in (worker, sender):
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
