@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import select
 import termios
@@ -19,6 +20,8 @@ WRITE_TIMEOUT_S: Final = 0.04
 DRAIN_S: Final = 0.02
 BACKLOG_LIMIT_BYTES: Final = 96
 """A larger backlog means that the device has stopped reading (about two ticks of commands)."""
+PSEUDO_TERMINAL_MAJORS: Final = range(136, 144)
+"""Major device numbers of pseudo-terminals on Linux, the ports of emulated devices."""
 
 
 def serial_ports() -> list[str]:
@@ -50,9 +53,11 @@ class SerialLink:
         if self._serial is not None:
             return
         try:
-            self._serial = serial.Serial(self.port, self.baud, timeout=0, exclusive=True)
+            port = serial.Serial(self.port, self.baud, timeout=0, exclusive=True)
+            _exclude_other_programs(port.fileno())
         except (OSError, ValueError, OverflowError, termios.error) as error:  # SerialException is an OSError
             raise NotReadyError(f"Serial port {self.port} cannot be opened", (self._reason(error),)) from error
+        self._serial = port
         self.statistics.opens += 1
 
     def write(self, data: bytes) -> None:
@@ -138,6 +143,15 @@ class SerialLink:
             return f"it does not exist; {there}. Plug the device in and set '{self.setting}' in [hardware.actuator]."
         if (isinstance(error, OSError) and error.errno == errno.EACCES) or "Permission" in str(error):
             return "permission is denied; add yourself to its group (often 'dialout') and log in again."
-        if "exclusively lock" in str(error) or "Resource temporarily unavailable" in str(error):
+        if "exclusively lock" in str(error) or getattr(error, "errno", 0) in (errno.EAGAIN, errno.EBUSY):
             return "another program uses it; close that program."
         return f"{error}. Check that '{self.setting}' in [hardware.actuator] names the device."
+
+
+def _exclude_other_programs(descriptor: int) -> None:
+    """Let no other program open the port, also one that ignores the lock of pyserial, such as VESC Tool.
+
+    A pseudo-terminal would refuse every program for ever if this process were killed, so it is left out.
+    """
+    if os.major(os.fstat(descriptor).st_rdev) not in PSEUDO_TERMINAL_MAJORS:
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
