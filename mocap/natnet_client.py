@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Self
 
-from carlab.core.errors import NotOpenError, ProtocolError
+from carlab.core.errors import ProtocolError
 from mocap.config import MocapConfig
 from mocap.natnet.bitstream_switch import BitstreamSwitch
 from mocap.natnet.codec import (
@@ -33,7 +33,7 @@ from mocap.natnet.codec import (
     split_message,
 )
 from mocap.natnet.message_schedule import MessageSchedule
-from mocap.natnet.models import FRAME_MODELS_CHANGED, Description, check_readable
+from mocap.natnet.models import FRAME_MODELS_CHANGED, FRAME_RECORDING, Description, ServerMode, check_readable
 from mocap.natnet.sockets import (
     DATAGRAM_BYTES,
     DEFAULT_DATA_PORT,
@@ -70,6 +70,7 @@ class NatNetClient:
         self.config = config
         self.server_info: ServerInfo | None = None
         self.models: tuple[Description, ...] | None = None
+        self.server_mode: int | None = None
         self.alignment = ClockAlignment(0.0)
         self._on_frame = on_frame
         self._on_models = on_models
@@ -77,6 +78,7 @@ class NatNetClient:
         self._statistics = StreamStatistics()
         self._decoder: BitstreamSwitch | None = None
         self._responses: list[Response | None] = []
+        self._polls_mode = self._is_recording = False
         self._server = ""
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
@@ -130,6 +132,7 @@ class NatNetClient:
         if not unicast:
             group = config.multicast_group or info.multicast_group or DEFAULT_GROUP
             self._data = multicast_receiver(group, config.data_port or info.data_port or DEFAULT_DATA_PORT, interface)
+        self._polls_mode = True
         if not self._send_until(MessageId.REQUEST_MODELDEF, b"", lambda: self.models is not None):
             detail = self._statistics.last_error or "the request had no answer; restart streaming in Motive."
             raise not_ready(f"no model definitions within {config.timeout_s:g} s: {detail}")
@@ -177,21 +180,15 @@ class NatNetClient:
     def __exit__(self, *exc_info: object) -> None:
         self.close()
 
-    def request(self, command: str, timeout_s: float | None = None) -> Response:
-        """Send a command such as ``FrameRate`` and return the answer.
+    @property
+    def is_live(self) -> bool:
+        """Whether the frames show what the cameras see now, and not a recorded take; True if the server is silent.
 
-        Raises NotOpenError before ``open`` and NotReadyError without an answer. Send one request at a time, since
-        answers do not contain their request.
+        Motive's answer 1 means recording in one version of its documentation and Edit mode in another one.
         """
-        if self._thread is None:
-            raise NotOpenError("The NatNet client is not open; call open() first.")
-        self._responses.clear()
-        if not self._send_until(MessageId.REQUEST, encode_request(command), lambda: bool(self._responses), timeout_s):
-            raise not_ready(f"the server did not answer the request '{command}'; is Motive still running?")
-        response = self._responses[0]
-        if response is None:
-            raise not_ready(f"the server does not know the request '{command}'; check its spelling.")
-        return response
+        if self.server_mode == ServerMode.RECORDING_OR_EDIT:
+            return self._is_recording
+        return self.server_mode in (None, ServerMode.LIVE)
 
     @property
     def version(self) -> BitstreamVersion | None:
@@ -223,7 +220,8 @@ class NatNetClient:
         return numbers
 
     def _reset(self) -> None:
-        self.server_info = self.models = self._decoder = None
+        self.server_info = self.models = self.server_mode = self._decoder = None
+        self._polls_mode = self._is_recording = False
         self.alignment = ClockAlignment(0.0)
         self._statistics = StreamStatistics()
         self._failure = None
@@ -319,10 +317,8 @@ class NatNetClient:
             elif message_id == MessageId.MODELDEF and self._decoder is not None:
                 models = self.models = self._decoder.decode_models(payload)
                 self._schedule.models_outdated = False
-            elif message_id == MessageId.RESPONSE:
-                self._responses.append(Response(payload))
-            elif message_id == MessageId.UNRECOGNIZED_REQUEST:
-                self._responses.append(None)
+            elif message_id in (MessageId.RESPONSE, MessageId.UNRECOGNIZED_REQUEST):
+                self._handle_response(Response(payload) if message_id == MessageId.RESPONSE else None)
             elif message_id == MessageId.MESSAGESTRING:
                 _log.info("Message from the NatNet server: %s", decode_text(payload))
             self._changed.notify_all()
@@ -347,6 +343,13 @@ class NatNetClient:
         if before is None or before.clock_hz != info.clock_hz:
             self.alignment = ClockAlignment(float(info.clock_hz))
 
+    def _handle_response(self, response: Response | None) -> None:
+        """Store the answer to the request for the mode, or to that for a bitstream version before."""
+        if not self._polls_mode:
+            self._responses.append(response)
+        elif response is not None and len(response.data) == 4:
+            self.server_mode = response.as_int()
+
     def _wants_other_bitstream(self, info: ServerInfo) -> bool:
         return (
             self.config.mode == "unicast"
@@ -364,6 +367,7 @@ class NatNetClient:
             if sequence is None:
                 return
             capture_s = self._capture_time(frame, received_s)
+            self._is_recording = bool(frame.params & FRAME_RECORDING)
             if frame.params & FRAME_MODELS_CHANGED:
                 self._schedule.models_outdated = True
         if self._on_frame is not None:
@@ -384,10 +388,11 @@ class NatNetClient:
         if self.server_info is None:
             return
         settled = self.alignment.echoes >= MIN_ECHOES and not self.alignment.is_uncertain
-        for message_id in self._schedule.due(now_s, has_clock=self.server_info.clock_hz > 0, settled=settled):
-            payload = b""
-            if message_id == MessageId.CONNECT:
-                payload = self._connect_payload()
-            elif message_id == MessageId.ECHOREQUEST:
-                payload = encode_echo_request(time.monotonic_ns())
-            self._send(message_id, payload)
+        payloads: dict[MessageId, Callable[[], bytes]] = {
+            MessageId.CONNECT: self._connect_payload,
+            MessageId.ECHOREQUEST: lambda: encode_echo_request(time.monotonic_ns()),
+            MessageId.REQUEST: lambda: encode_request("CurrentMode"),
+        }
+        has_clock, polls_mode = self.server_info.clock_hz > 0, self._polls_mode
+        for message_id in self._schedule.due(now_s, has_clock=has_clock, settled=settled, polls_mode=polls_mode):
+            self._send(message_id, payloads.get(message_id, bytes)())

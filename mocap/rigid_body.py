@@ -137,6 +137,8 @@ class RigidBodyPoseSource:
                     f"more than {RECENT_SHARE:.0%} of the newest frames have an invalid pose of the body (NaN or no "
                     "unit quaternion); restart streaming in Motive."
                 )
+        if not self._client.is_live:
+            found.append("Motive is in Edit mode and streams a recorded take; switch it to Live mode.")
         info = self._client.server_info
         has_clock = info is not None and info.clock_hz > 0
         if self._is_open and has_clock and not self._client.alignment.is_aligned:

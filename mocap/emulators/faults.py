@@ -28,6 +28,8 @@ class ServerFaults:
     """Share of frames that are sent twice."""
     frozen: bool = False
     """Frames repeat the last pose with fresh stamps."""
+    server_mode: int = 0
+    """Answer to the request for the mode: 0 for live, otherwise the poses may be those of a recorded take."""
     no_frames: bool = False
     """The server sends no frames."""
     no_answers: bool = False

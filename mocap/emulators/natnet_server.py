@@ -357,7 +357,7 @@ class NatNetServer:
             "FrameRate": float(self.rate_hz),
             "AnalogSamplesPerMocapFrame": 0,
             "UnitsToMillimeters": 1000.0,
-            "CurrentMode": 0,
+            "CurrentMode": self.faults.server_mode,
             "Bitstream": f"Bitstream,{client.version if client else self.version}",
         }
         if command == "Bitstream" and argument:

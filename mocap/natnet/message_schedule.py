@@ -13,10 +13,12 @@ FIRST_ECHO_PERIOD_S = 0.02
 RECONNECT_PERIOD_S = 2.0
 """Time without a frame after which the client reconnects, since the server may have been restarted [s]."""
 MODELS_PERIOD_S = 1.0
+MODE_PERIOD_S = 0.5
+"""Period of requests for the server's mode [s]."""
 
 
 class MessageSchedule:
-    """Schedule of keep-alives, echoes, reconnects and requests for changed models.
+    """Schedule of keep-alives, echoes, reconnects and requests for the server's mode and for changed models.
 
     ``models_outdated`` is set by frames with the models-changed flag and cleared when models arrive, so that a lost
     request is repeated and a further change is noticed.
@@ -26,7 +28,7 @@ class MessageSchedule:
         self.models_outdated = False
         self.reconnecting = False
         self._keepalives = keepalives
-        self._next_keepalive_s = self._next_echo_s = self._next_models_s = -math.inf
+        self._next_keepalive_s = self._next_echo_s = self._next_models_s = self._next_mode_s = -math.inf
         self._next_connect_s = math.inf
 
     def note_frame(self, now_s: float) -> None:
@@ -42,7 +44,7 @@ class MessageSchedule:
         """Send the next echo soon, since the clocks may be misaligned."""
         self._next_echo_s = min(self._next_echo_s, now_s + FIRST_ECHO_PERIOD_S)
 
-    def due(self, now_s: float, *, has_clock: bool, settled: bool) -> list[MessageId]:
+    def due(self, now_s: float, *, has_clock: bool, settled: bool, polls_mode: bool = False) -> list[MessageId]:
         """Messages to send now; they count as sent. Echoes are less frequent if the clock is ``settled``."""
         messages = []
         if self._keepalives and now_s >= self._next_keepalive_s:
@@ -58,4 +60,7 @@ class MessageSchedule:
         if self.models_outdated and now_s >= self._next_models_s:
             self._next_models_s = now_s + MODELS_PERIOD_S
             messages.append(MessageId.REQUEST_MODELDEF)
+        if polls_mode and now_s >= self._next_mode_s:
+            self._next_mode_s = now_s + MODE_PERIOD_S
+            messages.append(MessageId.REQUEST)
         return messages

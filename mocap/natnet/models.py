@@ -141,6 +141,15 @@ class AnalogSource(NamedTuple):
     channels: tuple[tuple[float, ...], ...]
 
 
+class ServerMode(enum.IntEnum):
+    """Mode of the server, its answer to the request CurrentMode. Higher numbers are further kinds of Edit mode."""
+
+    LIVE = 0
+    RECORDING_OR_EDIT = 1
+    EDIT = 2
+
+
+FRAME_RECORDING = 0x01
 FRAME_MODELS_CHANGED = 0x02
 FRAME_BITSTREAM_CHANGED = 0x08
 

@@ -58,16 +58,6 @@ def test_host_names_are_resolved(serve: Serve, configure: Configure, until: Unti
         until(lambda: client.statistics()["frames"] > 0.0)
 
 
-def test_unknown_and_unanswered_requests_are_reported(serve: Serve, configure: Configure) -> None:
-    server = serve()
-    with NatNetClient(configure(server)) as client:
-        with pytest.raises(NotReadyError, match="does not know the request 'FrameRat'"):
-            client.request("FrameRat")
-        server.faults = ServerFaults(no_answers=True)
-        with pytest.raises(NotReadyError, match="did not answer the request 'FrameRate'"):
-            client.request("FrameRate", timeout_s=0.2)
-
-
 def test_port_in_use_is_reported(serve: Serve) -> None:
     used_port = serve().command_port
     with pytest.raises(NotReadyError, match=f"{used_port} cannot be used .*close the program"):

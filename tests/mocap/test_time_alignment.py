@@ -193,6 +193,9 @@ def test_messages_are_sent_on_schedule() -> None:
     unsettled = sent_in(MessageSchedule(keepalives=False), 100.0, 101.0, has_clock=True, settled=False)
     assert 30 <= unsettled.count(MessageId.ECHOREQUEST) <= 51
     assert MessageId.KEEPALIVE not in unsettled
+    assert MessageId.REQUEST not in unsettled
+    polled = sent_in(MessageSchedule(keepalives=False), 100.0, 101.995, has_clock=False, settled=True, polls_mode=True)
+    assert polled == [MessageId.REQUEST] * 4
 
 
 def test_models_are_requested_once_a_second_until_they_arrive() -> None:
