@@ -69,7 +69,7 @@ class CanLink:
             self._lock.acquire()
         try:
             self._bus = self._open_bus()
-        except (can.CanError, OSError, ValueError, OverflowError, ImportError, NotImplementedError) as error:
+        except Exception as error:
             self._unlock()
             raise NotReadyError(
                 f"CAN bus {self.interface} {self.channel} cannot be opened", (self._reason(error),)
@@ -163,4 +163,4 @@ class CanLink:
                 f"{cause}; {there}. Bring it up with 'ip link set {self.channel} up type can bitrate {self.bitrate} "
                 "restart-ms 100' and set 'channel' in [hardware.actuator]."
             )
-        return f"{cause}. Check 'interface' and 'channel' in [hardware.actuator]."
+        return f"{cause}. Check 'interface' and 'channel' in [hardware.actuator], and the driver of the adapter."

@@ -10,7 +10,7 @@ import can
 import pytest
 from can.interfaces.virtual import VirtualBus
 
-from carlab.core.errors import ActuatorFaultError
+from carlab.core.errors import ActuatorFaultError, NotReadyError
 from drivers.links.can_link import CanLink
 from drivers.vesc import can_codec as vesc_can_codec
 
@@ -88,6 +88,12 @@ def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
     with pytest.raises(ActuatorFaultError, match="bus-off"):
         link.read()
     link.close()
+
+
+@pytest.mark.parametrize(("interface", "channel"), [("kvaser", "0"), ("socketcand", "can0"), ("robotell", "")])
+def test_interface_that_raises_an_error_of_its_library_is_not_ready(interface: str, channel: str) -> None:
+    with pytest.raises(NotReadyError, match=r"cannot be opened: .* the driver of the adapter"):
+        CanLink(interface, channel).open()
 
 
 def test_adapter_that_cannot_be_shut_down_is_closed() -> None:
