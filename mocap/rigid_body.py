@@ -6,6 +6,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from itertools import takewhile
 from typing import Self
 
@@ -42,6 +43,7 @@ class RigidBodyPoseSource:
         self._new_sample = threading.Condition()
         self._samples: deque[PoseSample] = deque(maxlen=max_samples)
         self._body: RigidBodyDescription | None = None
+        self._selection = config
         self._is_open = False
         self._clear_counts()
 
@@ -66,6 +68,8 @@ class RigidBodyPoseSource:
         try:
             self._client.open()
             self._body = select_body(self._client.models or (), self.config)
+            # A body that is added later must not make the only body ambiguous.
+            self._selection = replace(self.config, body="" if self.config.body_id is not None else self._body.name)
             if self.wait_for(-(2**62), self.config.timeout_s) is None:
                 raise NotReadyError("No motion capture", [self._why_silent()])
         except BaseException:
@@ -190,7 +194,7 @@ class RigidBodyPoseSource:
         if not self._is_open:
             return
         try:
-            body = select_body(models, self.config)
+            body = select_body(models, self._selection)
         except NotReadyError:
             body = None
         with self._new_sample:

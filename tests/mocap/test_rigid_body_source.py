@@ -266,6 +266,20 @@ def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configur
         assert source.problems() == ()
 
 
+def test_body_that_is_added_later_does_not_replace_the_only_one(
+    serve: Serve, configure: Configure, until: Until
+) -> None:
+    server = serve(lambda t_s: [RigidBodySample.planar(t_s, 1.0, 2.0, 0.1)] * len(server._scene.bodies))
+    with RigidBodyPoseSource(configure(server)) as source:
+        server.set_bodies((EmulatedBody("tripod", 7), EmulatedBody()))
+        until(lambda: len(source.client.models or ()) == 5)
+        sequence = source.latest().sequence  # type: ignore[union-attr]
+        sample = source.wait_for(sequence + 20, 5.0)
+        assert sample is not None
+        assert sample.tracked
+        assert source.problems() == ()
+
+
 def test_body_is_selected_by_name_or_id(serve: Serve, configure: Configure) -> None:
     bodies = (EmulatedBody("car", 3), EmulatedBody("trailer", 4))
 
