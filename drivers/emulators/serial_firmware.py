@@ -52,7 +52,7 @@ class SerialFirmware:
         self.link = link
         self.baud = baud
         self.faults = WireFaults() if faults is None else faults
-        self.decoder = VescFrameDecoder(inter_byte_timeout_s=None)
+        self.decoder = VescFrameDecoder(frame_timeout_s=None)
         self._lock = threading.Lock()
         self._master: int | None = None
         self._terminal = ""

@@ -7,6 +7,7 @@ Frame (vedderb/bldc comm/packet.c): ``02 LEN payload CRC16 03`` for 1 to 255 byt
 from __future__ import annotations
 
 import binascii
+from collections import deque
 from dataclasses import dataclass, field
 
 from carlab.core.errors import ProtocolError
@@ -36,39 +37,46 @@ class VescFrameDecoder:
     """Decoder from bytes to payloads, with one-byte resynchronisation like the firmware's decoder.
 
     If the buffer does not begin with a valid frame, one byte is dropped and the search continues at the next byte. A
-    false start byte hides a valid frame for at most its false length of up to 512 bytes. If no byte arrives for
-    ``inter_byte_timeout_s`` the unfinished frame is dropped in the same way, and valid frames inside it are decoded.
+    false start byte hides valid frames for at most its false length of up to 512 bytes, and for at most
+    ``frame_timeout_s`` (None for no limit): a frame that is unfinished then is dropped in the same way, and valid
+    frames inside it are decoded. The longest frame takes 45 ms at 115200 baud.
     """
 
-    inter_byte_timeout_s: float | None = 0.03
+    frame_timeout_s: float | None = 0.1
     frames: int = 0
     crc_errors: int = 0
     garbage_bytes: int = 0
     timeouts: int = 0
     _buffer: bytearray = field(default_factory=bytearray)
-    _t_last_byte_s: float = 0.0
+    _arrivals: deque[tuple[int, float]] = field(default_factory=deque)
+    """For each chunk with bytes in the buffer: number of bytes received with it, and time [s]."""
+    _received: int = 0
 
     def feed(self, data: bytes, t_s: float) -> list[bytes]:
         """Add bytes that arrived at ``t_s`` (any monotonic clock; may be empty) and return complete payloads."""
         payloads: list[bytes] = []
-        if self._is_overdue(t_s):
-            self.timeouts += 1
-            while self._buffer:
-                self._drop_byte()
-                self._scan(payloads)
+        self.timeouts += self._is_overdue(t_s)
+        while self._is_overdue(t_s):
+            self._drop_byte()
+            self._scan(payloads)
         if data:
             self._buffer += data
-            self._t_last_byte_s = t_s
+            self._received += len(data)
+            self._arrivals.append((self._received, t_s))
             self._scan(payloads)
         return payloads
 
     def clear(self) -> None:
         """Drop an unfinished frame, after the link was opened again."""
-        self._buffer.clear()
+        self._remove(len(self._buffer))
 
     def _is_overdue(self, t_s: float) -> bool:
-        limit_s = self.inter_byte_timeout_s
-        return bool(self._buffer) and limit_s is not None and t_s - self._t_last_byte_s > limit_s
+        """Whether the first byte of the buffer has waited too long for the rest of its frame."""
+        return (
+            self.frame_timeout_s is not None
+            and bool(self._arrivals)
+            and t_s - self._arrivals[0][1] > self.frame_timeout_s
+        )
 
     def _scan(self, payloads: list[bytes]) -> None:
         while self._buffer:
@@ -81,7 +89,7 @@ class VescFrameDecoder:
                 continue
             payloads.append(bytes(self._buffer[start:end]))
             self.frames += 1
-            del self._buffer[: end + 3]
+            self._remove(end + 3)
 
     def _frame_span(self) -> tuple[int, int] | None:
         """Start and end of the payload of a frame at the front; (0, 0) if no frame starts there; None if incomplete."""
@@ -109,5 +117,10 @@ class VescFrameDecoder:
         return start, end
 
     def _drop_byte(self) -> None:
-        del self._buffer[0]
+        self._remove(1)
         self.garbage_bytes += 1
+
+    def _remove(self, count: int) -> None:
+        del self._buffer[:count]
+        while self._arrivals and self._arrivals[0][0] <= self._received - len(self._buffer):
+            self._arrivals.popleft()

@@ -122,15 +122,15 @@ def test_old_firmware_is_refused_with_the_remedy(major: int, minor: int, is_refu
 def test_decoder_resynchronises_like_the_firmware(vesc_vectors: list[dict[str, Any]]) -> None:
     for vector in of_kind(vesc_vectors, "resync"):
         for chunk in (1, 1000):
-            decoder = VescFrameDecoder(inter_byte_timeout_s=None)
+            decoder = VescFrameDecoder(frame_timeout_s=None)
             data = bytes.fromhex(vector["hex"])
             decoded_payloads = [p for i in range(0, len(data), chunk) for p in decoder.feed(data[i : i + chunk], 0.0)]
             assert [p.hex() for p in decoded_payloads] == vector["payloads_fw"], vector["meaning"]
 
 
 @pytest.mark.parametrize("hidden", ["02ff020100000003", "030100020104408403"])
-def test_inter_byte_timeout_decodes_frames_behind_a_false_header(hidden: str) -> None:
-    decoder = VescFrameDecoder(inter_byte_timeout_s=0.03)
+def test_timeout_decodes_frames_behind_a_false_header(hidden: str) -> None:
+    decoder = VescFrameDecoder(frame_timeout_s=0.03)
     assert decoder.feed(bytes.fromhex(hidden), 1.0) == []
     assert decoder.feed(b"", 1.02) == []
     (payload,) = decoder.feed(b"", 1.04)
@@ -138,9 +138,21 @@ def test_inter_byte_timeout_decodes_frames_behind_a_false_header(hidden: str) ->
     assert decoder.timeouts == 1
 
 
+@pytest.mark.parametrize("noise", ["02ff", "030100", "030200"])
+def test_false_header_hides_telemetry_only_until_the_timeout(noise: str) -> None:
+    """Replies at 50 Hz continue to arrive, 236 to 495 bytes until the false length is reached."""
+    decoder = VescFrameDecoder(frame_timeout_s=0.1)
+    reply = bytes(17)
+    received = decoder.feed(bytes.fromhex(noise), 0.0)
+    for k in range(1, 7):
+        received += decoder.feed(encode_frame(reply), 0.02 * k)
+    assert received == [reply] * 6
+    assert decoder.garbage_bytes == len(noise) // 2
+
+
 def test_frame_after_an_incomplete_frame_is_decoded() -> None:
     frame = encode_frame(payloads.get_values())
-    decoder = VescFrameDecoder(inter_byte_timeout_s=0.03)
+    decoder = VescFrameDecoder(frame_timeout_s=0.03)
     assert decoder.feed(frame[:3], 0.0) == []
     assert decoder.feed(frame, 0.1) == [payloads.get_values()]
     assert decoder.timeouts == 1
