@@ -2,7 +2,7 @@
 
 Behaviour (vedderb/bldc comm/commands.c, timeout.c): SET_* and ALIVE have no reply and reset the motor's time-out;
 servo commands and requests for values do not reset it; the servo has no time-out. A time-out releases the motor; the
-next SET_* acts at once.
+next SET_* acts at once. During a fault, and while the kill switch is pressed, motor commands release the motor.
 """
 
 from __future__ import annotations
@@ -112,6 +112,8 @@ class VescFirmware:
         """Execute a decoded motor command (simple CAN frames use this)."""
         self.log.add(t_s, name, value)
         self._feed(t_s)
+        if self.fault_code or self.kill_switch:
+            name, value = "release", 0.0
         if self.on_motor is not None:
             self.on_motor(t_s, name, value)
 

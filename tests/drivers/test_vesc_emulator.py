@@ -46,6 +46,17 @@ def test_motor_times_out_and_only_motor_commands_reset_its_timer() -> None:
     assert moves[2:] == [(110.0, "brake", -1.5), (110.1, "duty", 0.2)], "works again at once; ALIVE resets the timer"
 
 
+@pytest.mark.parametrize(("name", "value"), [("fault_code", 2), ("kill_switch", True)])
+def test_fault_and_kill_switch_release_the_motor(name: str, value: int) -> None:
+    moves: list[tuple[str, float]] = []
+    firmware = VescFirmware(CommandLog(), on_motor=lambda t, kind, value: moves.append((kind, value)))
+    firmware.set_motor("current", 1.5, 100.0)
+    setattr(firmware, name, value)
+    firmware.set_motor("current", 1.5, 100.01)
+    assert moves == [("current", 1.5), ("release", 0.0)]
+    assert [e.value for e in firmware.log.motor()] == [1.5, 1.5], "the log has the commands that arrived"
+
+
 def test_replies_have_the_real_layout(vesc_vectors: list[dict[str, Any]]) -> None:
     vector = next(v for v in vesc_vectors if v["kind"] == "get_values_selective")
     readings = MotorValues(erpm=-12345.0, input_v=14.8, tachometer_steps=-77.0, fault_code=7)
