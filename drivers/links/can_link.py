@@ -93,7 +93,7 @@ class CanLink:
             raise self._failed(error) from error
 
     def read(self) -> list[CanFrame]:
-        """Frames that have arrived. Raises ActuatorFaultError on bus-off or a lost adapter."""
+        """Frames of others that have arrived. Raises ActuatorFaultError on bus-off or a lost adapter."""
         bus = self._opened()
         frames: list[CanFrame] = []
         for _ in range(MAX_FRAMES_PER_READ):
@@ -108,7 +108,7 @@ class CanLink:
                 if message.arbitration_id & BUS_OFF:
                     self._flush()
                     raise self._failed("the controller went bus-off")
-            elif message.is_extended_id and not message.is_remote_frame:
+            elif message.is_extended_id and not message.is_remote_frame and not self._is_echo(message):
                 frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
         return frames
 
@@ -137,6 +137,13 @@ class CanLink:
         if self._bus is None:
             raise ActuatorFaultError(f"CAN bus {self.interface} {self.channel} is not open; open the car first.")
         return self._bus
+
+    def _is_echo(self, message: can.Message) -> bool:
+        """Whether an adapter such as gs_usb returns a frame of this link.
+
+        socketcan returns none, but marks the frames of other programs on this computer in the same way.
+        """
+        return not message.is_rx and self.interface != "socketcan"
 
     def _has_input(self) -> bool:
         """Whether ``recv`` returns at once: without input it waits as long as a backward step of the system clock."""

@@ -90,6 +90,15 @@ def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
     link.close()
 
 
+def test_echo_of_an_own_frame_is_ignored() -> None:
+    link = BrokenLink("virtual", f"test-{uuid.uuid4()}")
+    link.open()
+    for is_rx in (False, True):
+        link.bus.received = can.Message(arbitration_id=0x117, data=bytes(4), is_rx=is_rx)
+        assert len(link.read()) == is_rx
+    link.close()
+
+
 @pytest.mark.parametrize(("interface", "channel"), [("kvaser", "0"), ("socketcand", "can0"), ("robotell", "")])
 def test_interface_that_raises_an_error_of_its_library_is_not_ready(interface: str, channel: str) -> None:
     with pytest.raises(NotReadyError, match=r"cannot be opened: .* the driver of the adapter"):
