@@ -265,6 +265,14 @@ def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBody
         wanted, chosen = f"'{config.body}'", [b for b in bodies if b.name == config.body]
     else:
         wanted, chosen = "that is the only one", bodies if len(bodies) == 1 else []
+    if chosen and len(sharing := [b.name for b in bodies if b.id == chosen[0].id]) > 1:
+        raise NotReadyError(
+            "No motion capture",
+            [
+                f"the rigid bodies {' and '.join(map(repr, sharing))} have the same streaming id {chosen[0].id}, "
+                "by which frames identify a body; give each its own in Motive's Properties pane."
+            ],
+        )
     if len(chosen) == 1:
         return chosen[0]
     available = ", ".join(f"'{b.name}' (id {b.id})" for b in bodies)

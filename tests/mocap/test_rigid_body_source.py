@@ -308,6 +308,15 @@ def test_missing_body_and_duplicate_names_are_reported() -> None:
     assert select_body(twins, MocapConfig(body_id=2)) is twins[1]
 
 
+def test_two_bodies_with_one_streaming_id_are_refused() -> None:
+    """Frames have no names: the first body with the id would be taken for the car."""
+    bodies = (RigidBodyDescription("lorry", 1), RigidBodyDescription("car", 1), RigidBodyDescription("tripod", 2))
+    for config in (MocapConfig(body="car"), MocapConfig(body_id=1)):
+        with pytest.raises(NotReadyError, match="'lorry' and 'car' have the same streaming id 1"):
+            select_body(bodies, config)
+    assert select_body(bodies, MocapConfig(body="tripod")) is bodies[2]
+
+
 def test_source_can_be_closed_and_opened_again(serve: Serve, configure: Configure) -> None:
     source = RigidBodyPoseSource(configure(serve(standing())))
     source.close()
