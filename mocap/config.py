@@ -10,6 +10,9 @@ from typing import Literal
 from carlab.core.errors import ConfigError, ProtocolError
 from mocap.natnet.models import NEWEST_BITSTREAM, OLDEST_BITSTREAM, BitstreamVersion
 
+MAX_YAW_OFFSET_RAD = 2.0 * math.pi
+MAX_PIVOT_M = 2.0
+"""Longest distance along one axis from base_link to the pivot [m]; a model car is shorter."""
 MAX_TIMEOUT_S = 600.0
 """Longest wait for a server [s]; a person notices earlier that it does not answer."""
 
@@ -57,6 +60,16 @@ class MocapConfig:
                 )
         if not all(map(math.isfinite, (self.yaw_offset_rad, *self.pivot_in_base_link_m))):
             raise ConfigError("'yaw_offset_rad' and 'pivot_in_base_link_m' in [hardware.mocap] must be finite numbers.")
+        if abs(self.yaw_offset_rad) > MAX_YAW_OFFSET_RAD:
+            raise ConfigError(
+                f"'yaw_offset_rad' in [hardware.mocap] is {self.yaw_offset_rad:g} rad; it must lie within one turn "
+                "(is it in degrees?)."
+            )
+        if max(map(abs, self.pivot_in_base_link_m)) > MAX_PIVOT_M:
+            raise ConfigError(
+                f"'pivot_in_base_link_m' in [hardware.mocap] is {list(self.pivot_in_base_link_m)} m; each coordinate "
+                f"must be at most {MAX_PIVOT_M:g} m (is it in millimetres?)."
+            )
         for name, low, option in (("command_port", 1, " (listen: --command-port)"), ("data_port", 0, "")):
             port = getattr(self, name)
             if not low <= port <= 65535:

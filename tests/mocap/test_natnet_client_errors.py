@@ -104,6 +104,8 @@ def test_invalid_server_options_are_refused(options: dict[str, Any], message: st
         ({"bitstream": "four"}, "4.1"),
         ({"bitstream": "4.3"}, "2.6 to 4.1"),
         ({"yaw_offset_rad": float("inf")}, "yaw_offset_rad"),
+        ({"yaw_offset_rad": -90.0}, "'yaw_offset_rad' .* is -90 rad; .*degrees"),
+        ({"pivot_in_base_link_m": (120.0, 0.0, 15.0)}, "at most 2 m .is it in millimetres"),
         ({"pivot_in_base_link_m": (0.0, float("nan"), 0.0)}, "pivot_in_base_link_m"),
     ],
 )
