@@ -143,11 +143,14 @@ class SenderProcess:
         return True
 
     def close(self) -> None:
-        """Close the wake line and wait; kill a process that does not end (the firmware's time-out stops the motor)."""
+        """Close the wake line and wait; kill a process that does not end (the firmware's time-out stops the motor).
+
+        A process that waits in a driver of the kernel, for a device that hangs, ends only after that wait.
+        """
         self._channel.close_wake_line()
         if not self.join(2.0):
             self._process.kill()
-            self._process.wait()
+            self.join(2.0)
         self._channel.close()
 
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -302,3 +303,23 @@ def test_sender_ends_if_the_main_process_dies_while_it_starts(firmware: SerialFi
                 for pid in (worker, sender):
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGKILL)
+
+
+def test_closing_does_not_wait_for_a_sender_that_cannot_be_killed(
+    firmware: SerialFirmware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in the kernel's wait for a device that hangs, where no signal ends a process."""
+    with firmware:
+        sender = SenderProcess(ActuatorConfig(port=firmware.port), ActuatorCalibration())
+        wait_for(lambda: len(firmware.log.motor()) > 3)
+        os.kill(sender.pid, signal.SIGSTOP)
+        monkeypatch.setattr(sender._process, "kill", lambda: None)
+        begin_s = time.monotonic()
+        closing = threading.Thread(target=sender.close)
+        closing.start()
+        closing.join(10.0)
+        duration_s = time.monotonic() - begin_s
+        os.kill(sender.pid, signal.SIGKILL)
+        closing.join()
+        sender._process.wait()
+        assert duration_s < 8.0
