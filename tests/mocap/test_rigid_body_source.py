@@ -269,7 +269,14 @@ def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configur
 def test_body_that_is_added_later_does_not_replace_the_only_one(
     serve: Serve, configure: Configure, until: Until
 ) -> None:
-    server = serve(lambda t_s: [RigidBodySample.planar(t_s, 1.0, 2.0, 0.1)] * len(server._scene.bodies))
+    servers: list[NatNetServer] = []
+
+    def poses(t_s: float) -> Sequence[RigidBodySample]:
+        n_bodies = len(servers[0]._scene.bodies) if servers else 1
+        return [RigidBodySample.planar(t_s, 1.0, 2.0, 0.1)] * n_bodies
+
+    server = serve(poses)
+    servers.append(server)
     with RigidBodyPoseSource(configure(server)) as source:
         server.set_bodies((EmulatedBody("tripod", 7), EmulatedBody()))
         until(lambda: len(source.client.models or ()) == 5)
