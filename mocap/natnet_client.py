@@ -39,6 +39,7 @@ from mocap.natnet.sockets import (
     DEFAULT_DATA_PORT,
     DEFAULT_GROUP,
     interface_towards,
+    join_group_again,
     multicast_receiver,
     not_ready,
     resolve,
@@ -82,6 +83,7 @@ class NatNetClient:
         self._server = ""
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
+        self._group = ("", "")
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._schedule = MessageSchedule(keepalives=config.mode == "unicast")
@@ -113,7 +115,6 @@ class NatNetClient:
         self._thread = threading.Thread(target=self._receive, name="natnet-receiver", daemon=True)
         self._thread.start()
         unicast = config.mode == "unicast"
-        wanted = config.bitstream_version
         if not self._send_until(MessageId.CONNECT, self._connect_payload(), lambda: self.server_info is not None):
             raise not_ready(
                 f"no NatNet server answered at {config.server_address}:{config.command_port} within "
@@ -128,10 +129,11 @@ class NatNetClient:
                 f'{info.name} streams by {found}; set mode = "{found}" in [hardware.mocap] (listen: --mode {found}), '
                 "or change Motive."
             )
-        self._agree_on_bitstream(info, wanted)
+        self._agree_on_bitstream(info)
         if not unicast:
             group = config.multicast_group or info.multicast_group or DEFAULT_GROUP
             self._data = multicast_receiver(group, config.data_port or info.data_port or DEFAULT_DATA_PORT, interface)
+            self._group = (group, interface)
         self._polls_mode = True
         if not self._send_until(MessageId.REQUEST_MODELDEF, b"", lambda: self.models is not None):
             detail = self._statistics.last_error or "the request had no answer; restart streaming in Motive."
@@ -140,9 +142,9 @@ class NatNetClient:
             # The thread sends the echoes; without answers, capture times are times of arrival.
             self._wait(lambda: self.alignment.echoes >= MIN_ECHOES, config.timeout_s)
 
-    def _agree_on_bitstream(self, info: ServerInfo, wanted: BitstreamVersion) -> None:
-        """Request ``wanted`` from a unicast server of NatNet 4 or later; until it takes effect both are decoded."""
-        decoder = self._decoder
+    def _agree_on_bitstream(self, info: ServerInfo) -> None:
+        """Request the version from a unicast server of NatNet 4 or later; until it takes effect both are decoded."""
+        decoder, wanted = self._decoder, self.config.bitstream_version
         assert decoder is not None
         if self._wants_other_bitstream(info):
             self._responses.clear()
@@ -182,10 +184,7 @@ class NatNetClient:
 
     @property
     def is_live(self) -> bool:
-        """Whether the frames show what the cameras see now, and not a recorded take; True if the server is silent.
-
-        Motive's answer 1 means recording in one version of its documentation and Edit mode in another one.
-        """
+        """Whether the frames show what the cameras see now, and not a recorded take; True if the server is silent."""
         if self.server_mode == ServerMode.RECORDING_OR_EDIT:
             return self._is_recording
         return self.server_mode in (None, ServerMode.LIVE)
@@ -396,3 +395,5 @@ class NatNetClient:
         has_clock, polls_mode = self.server_info.clock_hz > 0, self._polls_mode
         for message_id in self._schedule.due(now_s, has_clock=has_clock, settled=settled, polls_mode=polls_mode):
             self._send(message_id, payloads.get(message_id, bytes)())
+            if message_id == MessageId.CONNECT and self._data is not None:
+                join_group_again(self._data, *self._group)

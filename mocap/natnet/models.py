@@ -142,7 +142,10 @@ class AnalogSource(NamedTuple):
 
 
 class ServerMode(enum.IntEnum):
-    """Mode of the server, its answer to the request CurrentMode. Higher numbers are further kinds of Edit mode."""
+    """Mode of the server, its answer to the request CurrentMode. Higher numbers are further kinds of Edit mode.
+
+    1 means recording in the headers of the vendor, and Edit mode in the documentation of Motive 3.
+    """
 
     LIVE = 0
     RECORDING_OR_EDIT = 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import socket
 import sys
@@ -67,8 +68,7 @@ def multicast_receiver(group: str, port: int, interface: str) -> socket.socket:
     # On Linux a socket bound to the group receives nothing else; Windows cannot bind to a group.
     sock = udp_socket("" if sys.platform == "win32" else group, port, shared=True)
     try:
-        membership = socket.inet_aton(group) + socket.inet_aton(interface)
-        sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        join_group(sock, group, interface)
     except OSError as error:
         sock.close()
         raise not_ready(
@@ -76,3 +76,15 @@ def multicast_receiver(group: str, port: int, interface: str) -> socket.socket:
             "check local_interface (listen: --interface)."
         ) from error
     return sock
+
+
+def join_group(sock: socket.socket, group: str, interface: str) -> None:
+    """Receive datagrams to ``group`` at ``interface``. Raises OSError."""
+    membership = socket.inet_aton(group) + socket.inet_aton(interface)
+    sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+
+
+def join_group_again(sock: socket.socket, group: str, interface: str) -> None:
+    """Join after the network adapter was removed, which ends the membership; without effect for a member."""
+    with contextlib.suppress(OSError):  # a member, or the adapter is still missing
+        join_group(sock, group, interface)

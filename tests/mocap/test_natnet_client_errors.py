@@ -1,13 +1,16 @@
-"""Error messages of client, server, configuration and discovery."""
+"""Error messages and closing of client and server; configuration and discovery."""
 
 from __future__ import annotations
 
+import os
+import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.errors import ConfigError, NotOpenError, NotReadyError
 from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
@@ -56,6 +59,30 @@ def test_host_names_are_resolved(serve: Serve, configure: Configure, until: Unti
     config = configure(server, server_address="localhost", local_interface="localhost")
     with NatNetClient(config) as client:
         until(lambda: client.statistics()["frames"] > 0.0)
+
+
+def test_no_open_files_or_threads_remain_after_close(serve: Serve, configure: Configure, until: Until) -> None:
+    folder = "/proc/self/fd"
+    if not os.path.isdir(folder):
+        pytest.skip("open files cannot be counted without /proc")
+    server = serve(mode="multicast")
+    threads, files = threading.active_count(), len(os.listdir(folder))
+    for _ in range(3):
+        client = NatNetClient(configure(server))
+        client.open()
+        client.open()
+        client.close()
+        client.close()
+    failing_client = NatNetClient(configure(server, mode="unicast"))
+    with pytest.raises(NotReadyError):
+        failing_client.open()
+    failing_client.close()
+    assert (threading.active_count(), len(os.listdir(folder))) == (threads, files)
+    server.close()
+    server.close()
+    assert (threading.active_count(), len(os.listdir(folder))) == (threads - 1, files - 2)
+    with pytest.raises(NotOpenError, match="open"):
+        server.step(time.monotonic())
 
 
 def test_port_in_use_is_reported(serve: Serve) -> None:
