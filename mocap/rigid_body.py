@@ -21,6 +21,8 @@ MAX_SAMPLES = 1024
 NORM_TOLERANCE = 0.01
 TILT_LIMIT_RAD = math.radians(40.0)
 HEIGHT_LIMIT_M = 0.3
+MAX_LATENCY_MS = 100.0
+"""Largest median time from exposure to arrival [ms]: at 5 m/s a car drives half a metre in it."""
 RECENT_FRAMES = 60
 """Number of newest frames in which tilted and invalid poses are counted: half a second at 120 Hz, so that a car that
 was carried can be armed soon after it stands level again."""
@@ -143,6 +145,11 @@ class RigidBodyPoseSource:
                 )
         if not self._client.is_live:
             found.append("Motive is in Edit mode and streams a recorded take; switch it to Live mode.")
+        if self._client.statistics()["latency_p50_ms"] > MAX_LATENCY_MS:
+            found.append(
+                f"the poses arrive more than {MAX_LATENCY_MS:g} ms after their exposure, too late to control a car; "
+                "check the network and the load of Motive's computer."
+            )
         info = self._client.server_info
         has_clock = info is not None and info.clock_hz > 0
         if self._is_open and has_clock and not self._client.alignment.is_aligned:

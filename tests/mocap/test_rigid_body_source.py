@@ -24,10 +24,8 @@ from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
 from mocap.emulators.scene import EmulatedBody, RigidBodySample
-from mocap.natnet.codec import MessageId
-from mocap.natnet.models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription, ServerMode
+from mocap.natnet.models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription
 from mocap.natnet.sockets import udp_socket
-from mocap.natnet_client import NatNetClient
 from mocap.rigid_body import RigidBodyPoseSource, select_body
 
 Serve = Callable[..., NatNetServer]
@@ -133,45 +131,6 @@ def test_carried_car_is_no_problem_once_it_stands_level(serve: Serve, configure:
         until(lambda: any("vertically" in text for text in source.problems()))
         y_m[0] = 0.3
         until(lambda: source.problems() == ())
-
-
-class ServerWithoutEcho(NatNetServer):
-    """A server whose answers to clock echoes are lost."""
-
-    def _answer(self, message_id: int, payload: bytes, address: Any, now_s: float) -> tuple[int, bytes] | None:
-        return None if message_id == MessageId.ECHOREQUEST else super()._answer(message_id, payload, address, now_s)
-
-
-@pytest.mark.parametrize("server_mode", [1, 2, 3])
-def test_recorded_take_is_a_problem(serve: Serve, configure: Configure, until: Until, server_mode: int) -> None:
-    server = serve()
-    with RigidBodyPoseSource(configure(server)) as source:
-        until(lambda: source.client.server_mode == 0)
-        assert source.problems() == ()
-        server.faults = ServerFaults(server_mode=server_mode)
-        until(lambda: source.client.server_mode == server_mode)
-        assert source.problems() == ("Motive is in Edit mode and streams a recorded take; switch it to Live mode.",)
-        server.faults = ServerFaults()
-        until(lambda: source.problems() == ())
-
-
-def test_frames_that_are_being_recorded_are_live() -> None:
-    client = NatNetClient(MocapConfig())
-    client.server_mode = ServerMode.RECORDING_OR_EDIT
-    assert not client.is_live
-    client._is_recording = True
-    assert client.is_live
-
-
-def test_missing_clock_echo_is_a_problem_of_a_server_with_a_clock_only(
-    serve: Serve, configure: Configure, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with RigidBodyPoseSource(configure(serve(kind=ServerWithoutEcho), timeout_s=0.5)) as source:
-        (text,) = source.problems()
-        assert "clock echo" in text
-    monkeypatch.setattr("mocap.emulators.natnet_server.CLOCK_HZ", 0)
-    with RigidBodyPoseSource(configure(serve(kind=ServerWithoutEcho), timeout_s=0.5)) as source:
-        assert source.problems() == ()
 
 
 @pytest.mark.parametrize("version", ["3.0", "4.1"])
