@@ -11,7 +11,7 @@ import torch
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
-from carlab.core.planar import to_body
+from carlab.core.planar import to_body, to_world
 from carlab.core.quantities import FloatArray
 from carlab.prediction.initial_states import as_recorded
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
@@ -55,7 +55,9 @@ def sample_paths(
         action = torch.from_numpy(np.ascontiguousarray(command)).float().repeat_interleave(n_samples, dim=0)
         features = rollouts.step(features, action, generator)
         state, noise = decode_state(features), rollouts.measurement_noise(generator)
-        state = state if noise is None else state + noise
+        if noise is not None:
+            x, y = to_world(noise[:, 0], noise[:, 1], state[:, 2])
+            state = state + torch.cat([x[:, None], y[:, None], noise[:, 2:]], dim=1)
         states.append(state.view(len(initial_states), n_samples, 6))
     paths = torch.stack(states, dim=1).double().numpy()
     paths[..., 2] = np.unwrap(paths[..., 2], axis=1)

@@ -100,7 +100,7 @@ class Rollouts(Protocol):
         ...
 
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """Noise (N, 6) of measured states; None if the steps contain it."""
+        """Noise (N, 6) of measured states, positions along the body axes; None if the steps contain it."""
         ...
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
+from carlab.core.planar import to_body
+from carlab.prediction.learned import sample_paths
 from learning.posterior.sampler import Assignment
 from learning.world import disturbance_fit
 from learning.world.car_dynamics import CarDynamics
@@ -83,6 +86,19 @@ def test_each_rollout_keeps_its_particle() -> None:
     assert torch.bincount(nearest.argmin(dim=1)).min() >= 99
     stepwise = sampled(decaying_car(offsets, 1e-9), 300)[:, 3]
     assert float(stepwise.std()) < 0.4 * float(vx.std()), "with steps of random particles the offsets average out"
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.5 * math.pi])
+def test_measurement_noise_of_the_position_is_along_the_body_axes(yaw_rad: float) -> None:
+    posterior = replace(decaying_car(torch.zeros(2)).posterior, noise_std=torch.tensor([0.1, *(0.001,) * 5]))
+    process = DisturbanceProcess((1e-6,) * 3, (1.0,) * 3, PERIOD_S)
+    start = np.array([[0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0]])
+    none = np.zeros((1, 0, 2))
+    car = DisturbedCar(CarDynamics(posterior, 0), process)
+    paths = sample_paths(car, start, none, np.zeros((1, 1, 2)), n_samples=2000)
+    ahead, left = to_body(*np.moveaxis(paths[0, -1, :, :2], -1, 0), np.array(yaw_rad))
+    assert ahead.std() == pytest.approx(0.1, rel=0.05)
+    assert left.std() == pytest.approx(0.001, rel=0.05)
 
 
 def test_fit_recovers_scale_and_correlation_time() -> None:
