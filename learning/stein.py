@@ -22,6 +22,7 @@ class RbfKernel:
 
     def __call__(self, values: Tensor) -> Tensor:
         """Matrix (L, L) of values (L, F)."""
+        values = values - values.mean(dim=0)  # Close particles with a large common value differ in few digits.
         square = (values * values).sum(dim=1)
         distance = (square[:, None] + square[None, :] - 2.0 * values @ values.T).clamp_min(0.0)
         distance = distance - torch.diag(distance.diagonal())  # exactly one on the diagonal
@@ -31,6 +32,7 @@ class RbfKernel:
         """``sum_i`` of the gradient of ``k(h_i, h_l)`` with respect to ``h_i``, for each l: (L, F)."""
         # The term i = l is zero; it is omitted because its two parts would cancel only up to rounding.
         weight = (matrix - torch.diag(matrix.diagonal())) / self.bandwidth**2
+        values = values - values.mean(dim=0)
         return weight.sum(dim=1, keepdim=True) * values - weight @ values
 
 

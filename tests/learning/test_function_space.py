@@ -106,6 +106,15 @@ class TestStein:
                     total += (kernel_values[0] - kernel_values[1]) / (2 * step)
                 assert float(repulsion[which, k]) == pytest.approx(total, abs=1e-7)
 
+    def test_kernel_of_close_particles_is_exact_in_single_precision(self):
+        """The distances are a thousandth of the common value."""
+        values, kernel = 10.0 + 0.01 * normal(10, 336), RbfKernel(0.1)
+        single, matrix = values.float(), kernel(values.float())
+        exact = kernel(single.double())
+        assert torch.allclose(matrix.double(), exact, rtol=1e-4, atol=1e-6)
+        repulsion = kernel.repulsion(single, matrix).double()
+        assert torch.allclose(repulsion, kernel.repulsion(single.double(), exact), rtol=1e-3, atol=1e-4)
+
     def test_direction_of_one_particle_is_its_score(self):
         values, score = normal(1, 4, 2), normal(1, 4, 2, seed=1)
         assert torch.allclose(stein_direction(values, score, RbfKernel(0.7)), score)
