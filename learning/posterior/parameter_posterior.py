@@ -108,7 +108,7 @@ def _reweight(walkers: _Walkers, step: float, generator: torch.Generator) -> Ten
     normal, size = walkers.normal, walkers.normal.shape[1]
     weight = torch.softmax(step * walkers.log_likelihood, dim=0)
     chosen = _resample(weight, generator)
-    covariance = torch.cov(normal.T, aweights=weight).reshape(size, size)
+    covariance = torch.cov(normal.T, correction=0, aweights=weight).reshape(size, size)
     walkers.normal, walkers.log_likelihood = normal[chosen], walkers.log_likelihood[chosen]
     jitter = 1e-6 * torch.eye(size, dtype=torch.float64, device=normal.device)
     factor: Tensor = torch.linalg.cholesky(covariance + jitter)

@@ -191,6 +191,18 @@ def test_draws_avoid_parameters_with_invalid_outputs(broken):
     assert draws.std() == pytest.approx(std, rel=0.1)
 
 
+def test_one_draw_with_valid_outputs_suffices():
+    """Only 0.8 % of the prior mass give valid outputs; with this seed it is one of 128 draws."""
+
+    def shape(t):
+        return torch.where(t > 2.4, t, torch.full_like(t, torch.nan))
+
+    draws = draws_of_one_parameter(shape, [2.6], 0.5, count=128)
+    grid, weight = posterior_by_quadrature(lambda t: np.where(t > 2.4, -0.5 * ((2.6 - t) / 0.5) ** 2, np.nan))
+    assert draws.min() > 2.4
+    assert draws.mean() == pytest.approx((weight * grid).sum(), abs=0.06)
+
+
 def test_simulator_with_invalid_outputs_everywhere_is_refused():
     with pytest.raises(DataError, match="narrow the ranges"):
         draws_of_one_parameter(lambda t: torch.full_like(t, float("nan")), [0.5], 0.5)
