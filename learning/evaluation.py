@@ -76,7 +76,10 @@ class Mixture:
         return (self.epistemic_std**2 + self.aleatoric_std**2).sqrt()
 
     def smoothed(self, bandwidth: float = 0.9) -> Mixture:
-        """Kernel-smooth the components: they overlap, and the mean and (for Gaussians) the variance are unchanged.
+        """Kernel-smooth the components, so that they overlap.
+
+        The mean is unchanged, and so is the variance of Gaussians. With a decorrelation this is the variance of the
+        decorrelated errors; the added variance has the correlation of the components, not that of their means.
 
         Deviations from the mean shrink by ``sqrt(1 - b^2)``; the components' variance grows by ``b^2`` times the
         variance of their means (West 1993, "Approximating posterior distributions by mixture", section 3.2). For

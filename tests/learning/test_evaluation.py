@@ -72,7 +72,7 @@ class TestDecorrelatedErrors:
         assert calibration_error(flat, torch.tensor(draws)) < 0.005
         assert calibration_error(replace(flat, decorrelation=None), torch.tensor(draws)) > 0.05
 
-    def test_smoothing_keeps_the_covariance(self):
+    def test_smoothing_keeps_the_variance_of_decorrelated_errors(self):
         sharp = self.mixture()
         for mixture in (sharp, sharp.smoothed(0.6), sharp.gaussians()):
             decorrelated = mixture.means.numpy() @ self.DECORRELATION.T
