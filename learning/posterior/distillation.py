@@ -41,7 +41,7 @@ MIN_ROWS_FOR_NEIGHBOURS = 20
 MIN_ROWS_FOR_NOISE = 40
 """Minimum number of rows for the particles' misfit to be measured at the rows instead of the measurement points."""
 MIN_NOISE_SHARE = 0.5
-"""Lower bound of the particles' noise, relative to the measurement noise."""
+"""Lower bound of the variance of the particles' noise, relative to that of the measurement noise."""
 MAX_MISFIT_STD = 3.0
 """Upper bound of the misfit at a single row, in standard deviations of the noise."""
 SLOPE_PENALTY_SHARE = 1e-6
