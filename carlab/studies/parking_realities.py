@@ -51,7 +51,8 @@ class ArmFigures:
     Attributes:
         arm: name.
         runs: number of runs.
-        mean_first_parked: mean first episode that ended parked; a run that never parked counts as one episode longer.
+        mean_first_parked: mean first episode that ended parked; for a run that never parked, the last episode of the
+            longest run plus one.
         parked_early: share of runs that parked by episode ``EARLY_EPISODE``.
         parked_after: share of parked episodes after the first parked one; NaN without any.
         coverage: share of episodes whose return is in the predicted 90 % interval; NaN without a prediction.
@@ -93,11 +94,13 @@ def arm_of(name: str) -> dict[str, Any]:
 
 def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
     """One row per arm, in the order of the curves."""
-    nominal = {(c.reality, c.seed): _first(c) for c in curves if c.method == "nominal"}
+    never = 1 + max((e.episode for c in curves for e in c.episodes), default=0)
+    firsts = [c.first_parked or never for c in curves]
+    nominal = {(c.reality, c.seed): f for c, f in zip(curves, firsts, strict=True) if c.method == "nominal"}
     rows = []
     for arm in dict.fromkeys(c.method for c in curves):
         own = [c for c in curves if c.method == arm]
-        first = [_first(c) for c in own]
+        first = [f for c, f in zip(curves, firsts, strict=True) if c.method == arm]
         later = [e.success for c, f in zip(own, first, strict=True) for e in c.episodes if e.episode > f]
         inside = [
             e.predicted_low <= e.total_reward <= e.predicted_high
@@ -114,10 +117,6 @@ def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
             )
         )  # fmt: skip
     return rows
-
-
-def _first(curve: Curve) -> int:
-    return curve.first_parked if curve.first_parked is not None else len(curve.episodes) + 1
 
 
 def _mean(values: Sequence[bool]) -> float:

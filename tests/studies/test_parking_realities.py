@@ -45,6 +45,13 @@ def test_arms_are_compared_by_first_parked_episode_and_coverage() -> None:
     assert compared(curves[2:])[0].to_dict()["latest_against_nominal"] is None
 
 
+def test_an_unfinished_run_that_never_parked_is_not_earlier_than_a_finished_one() -> None:
+    curves = [curve("nominal", "patch", {5}), curve("auto", "patch", set(), (10.0, 10.0))]
+    nominal, auto = compared(curves)
+    assert (nominal.mean_first_parked, auto.mean_first_parked) == (5.0, 6.0)
+    assert auto.latest_against_nominal == 1.0
+
+
 def test_each_reality_is_a_car_that_differs_from_the_default(tmp_path: Path) -> None:
     nominal = SimulatorConfig.from_preset()
     for name, changes in REALITIES.items():
