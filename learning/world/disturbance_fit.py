@@ -70,8 +70,7 @@ def rollout_errors(car: CarDynamics, windows: DriveWindows) -> RolloutErrors:
     every = torch.arange(particles).repeat_interleave(count)
     paths = _paths(car, windows, torch.arange(count).repeat(particles), every, None)
     paths = paths.view(particles, count, steps, 6)[:, :, at]
-    noise = car.sampler.noise @ torch.eye(6).to(car.sampler.noise)
-    noise_variance = (noise**2).sum(dim=0) * car.sampler.scales.flatten().square().median()
+    noise_variance = (car.sampler.noise**2).sum(dim=0) * car.sampler.scales.flatten().square().median()
     error = paths.mean(dim=0) - windows.motion[:, at].to(paths)
     variance = paths.var(dim=0) + noise_variance
     pulses = _pulse_responses(car, windows)[:, at]
