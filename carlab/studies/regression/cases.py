@@ -1,8 +1,9 @@
 """Cases of the regression study: data, simulator and units.
 
 The cases are those of the paper (Rothfuss et al., arXiv 2403.16644, section 6.1) with the domains, priors and units of
-the authors' public code. Three more pendulums hide an effect that no family contains. Data is drawn by a simulator
-here, or read from arrays of the authors' code.
+the authors' public code. In the body frame, the race car has other units, and the domain of the data instead of the
+authors' wider measurement domain. Three more pendulums hide an effect that no family contains. Data is drawn by a
+simulator here, or read from arrays of the authors' code.
 """
 
 from __future__ import annotations
