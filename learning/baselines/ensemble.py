@@ -24,7 +24,7 @@ N_FOLDS = 5
 MIN_ROWS = 5
 """With fewer rows or fewer than four networks no rows are held out, and the noise is that fitted with the networks."""
 DISAGREEMENT_WEIGHTS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
-"""Candidate factors on the networks' variance in the predictive variance."""
+"""Candidate factors on the networks' variance in the predictive variance, in addition to the variance of their mean."""
 N_NOISE_ITERATIONS = 40
 MIN_NOISE_SHARE = 1e-3
 """Lower bound of the noise variance, relative to the mean square of the errors."""
@@ -91,11 +91,14 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
     networks = fit_fsvgd(inputs, outputs, inputs, None, decorrelated, settings, row_mask=~held_out)
     errors = Ensemble(networks).errors(inputs, outputs)
     mask = held_out.to(errors)[..., None]
-    mean = (mask * errors).sum(dim=0) / mask.sum(dim=0)
-    disagreement = (mask * (errors - mean) ** 2).sum(dim=0) / (mask.sum(dim=0) - 1.0).clamp_min(1.0)
-    candidates = [(*_noise(mean, weight * disagreement), weight) for weight in DISAGREEMENT_WEIGHTS]
+    members = mask.sum(dim=0)
+    mean = (mask * errors).sum(dim=0) / members
+    disagreement = (mask * (errors - mean) ** 2).sum(dim=0) / (members - 1.0).clamp_min(1.0)
+    # The mean of m networks has the variance of one divided by m; fewer networks hold out a row than predict.
+    candidates = [(*_noise(mean, (weight + 1.0 / members) * disagreement), weight) for weight in DISAGREEMENT_WEIGHTS]
     _, noise_std, weight = max(candidates, key=lambda candidate: candidate[0])
-    residuals = fit_residuals(mean / (noise_std**2 + weight * disagreement).sqrt())
+    residuals = fit_residuals(mean / (noise_std**2 + (weight + 1.0 / members) * disagreement).sqrt())
+    weight += 1.0 / settings.particles
     return Ensemble(networks, noise_std.to(outputs), weight, residuals.to(outputs))
 
 

@@ -145,6 +145,21 @@ def test_ensemble_noise_is_estimated_from_left_out_rows():
     )
 
 
+def test_ensemble_predicts_the_error_of_the_mean_of_all_members():
+    """Untrained members are independent: the mean of the four that hold out a row has five times the variance."""
+    squares = []
+    for seed in range(4):
+        x, y = (
+            torch.randn(1200, 3, generator=generator(seed)),
+            0.05 * torch.randn(1200, 1, generator=generator(10 + seed)),
+        )
+        units = Normaliser(torch.zeros(3), torch.ones(3), torch.zeros(1), torch.ones(1))
+        settings = FsvgdSettings(steps=0, hidden=(64,), seed=seed)
+        prediction = deep_ensemble(x[:200], y[:200], units, settings).predict(x[200:])
+        squares.append(float(((prediction.mean - y[200:]) / prediction.std).square().mean()))
+    assert 0.5 < sum(squares) / 4 < 1.5
+
+
 def test_equal_seeds_give_equal_models():
     pool = torch.linspace(-2, 2, 16)[:, None]
     settings = FsvgdSettings(steps=50, hidden=(8,))
