@@ -1,7 +1,8 @@
 """Deep ensemble: networks that differ by their initial weights (Lakshminarayanan et al. 2017).
 
-Each network is fitted without one fold of the rows; errors on these held-out rows determine the noise and the weight of
-the networks' disagreement.
+The networks are fitted to the residual of a ridge regression, as the particles of ``learning.posterior.distillation``
+are to that of a linear trend. Each network is fitted without one fold of the rows; errors on these held-out rows
+determine the noise and the weight of the networks' disagreement.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,7 +24,8 @@ from learning.posterior.residuals import ResidualDistribution, fit_residuals
 
 N_FOLDS = 5
 MIN_ROWS = 5
-"""With fewer rows or fewer than four networks no rows are held out, and the noise is that fitted with the networks."""
+"""With fewer rows or fewer than four networks there is no ridge regression, no rows are held out, and the noise is that
+fitted with the networks."""
 DISAGREEMENT_WEIGHTS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate factors on the networks' variance in the predictive variance, in addition to the variance of their mean."""
 N_NOISE_ITERATIONS = 40
@@ -35,7 +38,7 @@ class Ensemble:
     """Networks and the distribution of their mean's errors.
 
     Attributes:
-        networks: fitted independently, in decorrelated outputs.
+        networks: fitted independently, in decorrelated outputs, with the ridge regression as their trend.
         noise_std: of the decorrelated outputs (O,); None without held-out rows.
         disagreement_weight: factor on the networks' variance, which is added to the noise variance.
         residuals: distribution of errors in units of the total standard deviation; None without held-out rows.
@@ -70,6 +73,8 @@ class Ensemble:
 def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, settings: FsvgdSettings) -> Ensemble:
     """Fit every network independently to the likelihood, with weight decay as the only prior.
 
+    The networks are fitted to the leave-one-out errors of the ridge regression, so that held-out rows are new to both.
+
     Args:
         inputs: (n, D), n > 0.
         outputs: (n, O).
@@ -87,9 +92,12 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
         return Ensemble(fit_fsvgd(inputs, outputs, inputs, None, normaliser, settings))
     order = torch.randperm(count, generator=torch.Generator().manual_seed(settings.seed))
     held_out = (torch.arange(settings.particles)[:, None] % folds == order % folds).to(inputs.device)
-    decorrelated = _decorrelated(normaliser, inputs, outputs)
-    networks = fit_fsvgd(inputs, outputs, inputs, None, decorrelated, settings, row_mask=~held_out)
-    errors = Ensemble(networks).errors(inputs, outputs)
+    trend, residual = _ridge_trend(normaliser, inputs, outputs)
+    decorrelation = decorrelation_of(*output_correlation(residual)).to(outputs)
+    residual_outputs = normaliser.raw_outputs(residual.to(outputs))
+    decorrelated = normaliser.decorrelated(decorrelation)
+    networks = fit_fsvgd(inputs, residual_outputs, inputs, None, decorrelated, settings, row_mask=~held_out)
+    errors = Ensemble(networks).errors(inputs, residual_outputs)
     mask = held_out.to(errors)[..., None]
     members = mask.sum(dim=0)
     mean = (mask * errors).sum(dim=0) / members
@@ -99,14 +107,20 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
     _, noise_std, weight = max(candidates, key=lambda candidate: candidate[0])
     residuals = fit_residuals(mean / (noise_std**2 + (weight + 1.0 / members) * disagreement).sqrt())
     weight += 1.0 / settings.particles
+    networks = replace(networks, trend=trend.to(outputs) @ decorrelation.T)
     return Ensemble(networks, noise_std.to(outputs), weight, residuals.to(outputs))
 
 
-def _decorrelated(normaliser: Normaliser, inputs: Tensor, outputs: Tensor) -> Normaliser:
-    """Normaliser with outputs in which the errors of a ridge regression are uncorrelated."""
-    ridge = Ridge.fit(*(v.cpu().double().numpy() for v in (inputs, normaliser.outputs(outputs))))
-    correlation, width = output_correlation(torch.from_numpy(ridge.errors))
-    return normaliser.decorrelated(decorrelation_of(correlation, width).to(outputs))
+def _ridge_trend(normaliser: Normaliser, inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Ridge regression of normalised outputs on normalised inputs, in double precision on the CPU.
+
+    Returns:
+        Constant and slopes (1 + D, O), and the leave-one-out errors of the rows (n, O).
+    """
+    ridge = Ridge.fit(*(v.cpu().double().numpy() for v in (normaliser.inputs(inputs), normaliser.outputs(outputs))))
+    slopes = ridge.weights[:-1] / ridge.scale[:, None]
+    constant = ridge.weights[-1] - ridge.mean @ slopes
+    return torch.from_numpy(np.vstack([constant, slopes])), torch.from_numpy(ridge.errors)
 
 
 def _noise(errors: Tensor, known_variance: Tensor) -> tuple[float, Tensor]:
