@@ -53,7 +53,8 @@ DISCREPANCY_STD, DISCREPANCY_LENGTHSCALE = (0.008, 0.008, 0.01, 0.01, 0.08, 0.08
 """Of the simulator's discrepancy: standard deviations in the units of the changes, lengthscale on raw inputs."""
 DRAWS_PER_BATCH = 32
 PATIENCE = 3
-"""Evaluations without improvement that end a fit. The authors' fit continues but keeps the same networks."""
+"""Evaluations without improvement that end a fit. The authors' fit continues, and has the best networks of all
+evaluations; these are the same unless a later one is better."""
 
 
 def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, corrected: bool = False) -> FsvgdSettings:
