@@ -144,18 +144,16 @@ def seeded(key: str) -> Callable[[float, Draw], dict[str, float]]:
     return lambda size, draw: {key: size, "seed": math.floor(1e6 * draw.shares[0])}
 
 
+def servo_parameters(size: float, draw: Draw) -> dict[str, float]:
+    """Time constant [s], and the largest share of the acceleration that the time constant needs."""
+    return {"time_constant": size, "current_share": 0.3 + 0.4 * draw.shares[0]}
+
+
 FORMS = (
     Form("command_delay", "other", seeded("extra_delay"), packet_queue, 0.01, 0.15),
     Form("steering_delay", "other", plain("delay"), polled_steering, 0.01, 0.2),
     Form("throttle_delay", "other", plain("delay"), polled_throttle, 0.03, 0.4),
-    Form(
-        "steering_lag",
-        "other",
-        lambda size, draw: {"time_constant": size, "current_share": 0.3 + 0.4 * draw.shares[0]},
-        limited_servo,
-        0.01,
-        0.4,
-    ),
+    Form("steering_lag", "other", servo_parameters, limited_servo, 0.01, 0.4),
     Form("steering_rate_limit", "other", inverse("rate"), soft_rate_limit, 0.1, 1.5),
     Form("steering_backlash", "other", plain("play"), sprung_play, 0.01, 0.4),
     Form("steering_deadband", "other", plain("width"), soft_deadband, 0.01, 0.4),

@@ -5,21 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from carlab.benchmark.effects.catalogue import Form, Parameters, factor, plain, signed
+from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, heading, hook, plain, signed
 from carlab.benchmark.effects.force_forms import STICTION_MPS
-from carlab.benchmark.effects.tyre_forms import driven_wheels, placed, saturating, slipping
-from carlab.benchmark.world.base_car import GRAVITY_MPS2
+from carlab.benchmark.effects.tyre_forms import driven_wheels, placed, replace_tyres, saturating, slipping
+from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.physics import Instant, World
 
 
-def soft_motor(world: World, p: Parameters) -> None:
+@hook("drive")
+def soft_motor(now: Instant, p: Parameters, car: BaseCar) -> None:
     """A current limit that closes softly."""
     top = p["force"]
-
-    def soften(now: Instant) -> None:
-        now.drive = top * math.tanh(now.drive / top)
-
-    world.hooks["drive"].append(soften)
+    now.drive = top * math.tanh(now.drive / top)
 
 
 def charge_sag(world: World, p: Parameters) -> None:
@@ -34,56 +31,36 @@ def charge_sag(world: World, p: Parameters) -> None:
     world.hooks["drive"].append(sag)
 
 
-def soft_brake(world: World, p: Parameters) -> None:
+@hook("drive")
+def soft_brake(now: Instant, p: Parameters, car: BaseCar) -> None:
     """The gain changes smoothly over 0.2 m/s."""
-    ratio = p["gain_ratio"]
-
-    def brake(now: Instant) -> None:
-        against = 0.5 - 0.5 * math.tanh(math.copysign(1.0, now.drive) * now.vx / 0.2)
-        now.drive *= 1.0 + (ratio - 1.0) * against
-
-    world.hooks["drive"].append(brake)
+    against = 0.5 - 0.5 * math.tanh(math.copysign(1.0, now.drive) * now.vx / 0.2)
+    now.drive *= 1.0 + (p["gain_ratio"] - 1.0) * against
 
 
-def soft_traction(world: World, p: Parameters) -> None:
+@hook("limit")
+def soft_traction(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Grip that saturates gradually."""
-    share = p["share"]
-
-    def limit(now: Instant) -> None:
-        top = share * now.mu_r * now.fz_r
-        now.fx = top * math.tanh(now.fx / top)
-
-    world.hooks["limit"].append(limit)
+    top = p["share"] * now.mu_r * now.fz_r
+    now.fx = top * math.tanh(now.fx / top)
 
 
-def stribeck(world: World, p: Parameters) -> None:
+@hook("body")
+def stribeck(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Bearing friction that is larger at low speed."""
-    force = p["force"]
-
-    def resist(now: Instant) -> None:
-        now.push_x -= force * (1.0 + 0.6 * math.exp(-abs(now.vx) / 0.3)) * math.tanh(now.vx / STICTION_MPS)
-
-    world.hooks["body"].append(resist)
+    now.push_x -= p["force"] * (1.0 + 0.6 * math.exp(-abs(now.vx) / 0.3)) * math.tanh(now.vx / STICTION_MPS)
 
 
-def powered_drag(world: World, p: Parameters) -> None:
+@hook("body")
+def powered_drag(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Drag with an exponent slightly different from two."""
-    c, exponent = p["coefficient"], p["exponent"]
-
-    def resist(now: Instant) -> None:
-        now.push_x -= c * math.copysign(abs(now.vx) ** exponent, now.vx)
-
-    world.hooks["body"].append(resist)
+    now.push_x -= p["coefficient"] * math.copysign(abs(now.vx) ** p["exponent"], now.vx)
 
 
-def scrub(world: World, p: Parameters) -> None:
+@hook("body")
+def scrub(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Toe scrub of two front wheels: grows with the tangent of the wheel angle."""
-    c = p["coefficient"]
-
-    def resist(now: Instant) -> None:
-        now.push_x -= c * abs(math.tan(now.d)) * math.tanh(now.vx / 0.1)
-
-    world.hooks["body"].append(resist)
+    now.push_x -= p["coefficient"] * abs(math.tan(now.d)) * math.tanh(now.vx / 0.1)
 
 
 def brush_shape(slope: float) -> Callable[[float], float]:
@@ -100,27 +77,17 @@ def brush_shape(slope: float) -> Callable[[float], float]:
 
 def brush_tyre(world: World, p: Parameters) -> None:
     """A brush tyre with the slope and friction of the magic formula."""
-    world.shape_front = brush_shape(p["B_front"] * p["C_front"])
-    world.shape_rear = brush_shape(p["B_rear"] * p["C_rear"])
-
-    def grip(now: Instant) -> None:
-        now.mu_f, now.mu_r = p["mu_front"], p["mu_rear"]
-
-    world.hooks["grip"].insert(0, grip)
+    replace_tyres(world, p, lambda b, c: brush_shape(b * c))
 
 
-def combined_slip(world: World, p: Parameters) -> None:
+@hook("tyre")
+def combined_slip(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Side force times cos(atan(k)), k = scale F_x / (mu F_z).
 
     This is the form of the magic formula's weighting function for combined slip (Pacejka 2012, "Tire and Vehicle
     Dynamics", section 4.3.2), with force in place of slip.
     """
-    scale = p["scale"]
-
-    def weigh(now: Instant) -> None:
-        now.fr /= math.hypot(1.0, scale * now.fx / (now.mu_r * now.fz_r))
-
-    world.hooks["tyre"].append(weigh)
+    now.fr /= math.hypot(1.0, p["scale"] * now.fx / (now.mu_r * now.fz_r))
 
 
 def brush_slip(world: World, p: Parameters) -> None:
@@ -161,128 +128,93 @@ def pitching(world: World, p: Parameters) -> None:
     world.hooks["load"].append(shift)
 
 
-def settling_grip(world: World, p: Parameters) -> None:
+@hook("grip")
+def settling_grip(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Grip that changes exponentially within two minutes."""
     change = 120.0 * p["rate"]
-
-    def drift(now: Instant) -> None:
-        grip = 1.0 + change * (1.0 - math.exp(-now.t / 120.0))
-        now.mu_f *= grip
-        now.mu_r *= grip
-
-    world.hooks["grip"].append(drift)
+    grip = 1.0 + change * (1.0 - math.exp(-now.t / 120.0))
+    now.mu_f *= grip
+    now.mu_r *= grip
 
 
-def soft_patch(world: World, p: Parameters) -> None:
+@hook("grip")
+def soft_patch(now: Instant, p: Parameters, car: BaseCar) -> None:
     """A patch with a soft edge that acts on each axle separately."""
-    x, y, radius, loss, car = p["x"], p["y"], p["radius"], p["loss"], world.car
-
-    def slip(now: Instant) -> None:
-        cos, sin = math.cos(now.psi), math.sin(now.psi)
-        for along in (car.front_axle, -car.rear_axle):
-            away = math.hypot(now.x + along * cos - x, now.y + along * sin - y)
-            kept = 1.0 - 0.5 * loss * (1.0 - math.tanh((away - radius) / 0.08))
-            if along > 0.0:
-                now.mu_f *= kept
-            else:
-                now.mu_r *= kept
-
-    world.hooks["grip"].append(slip)
+    x, y, radius, loss = p["x"], p["y"], p["radius"], p["loss"]
+    cos, sin = math.cos(now.psi), math.sin(now.psi)
+    for along in (car.front_axle, -car.rear_axle):
+        away = math.hypot(now.x + along * cos - x, now.y + along * sin - y)
+        kept = 1.0 - 0.5 * loss * (1.0 - math.tanh((away - radius) / 0.08))
+        if along > 0.0:
+            now.mu_f *= kept
+        else:
+            now.mu_r *= kept
 
 
-def wing(world: World, p: Parameters) -> None:
+@hook("load", first=True)
+def wing(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Downforce behind the centre of mass: a tenth more on the rear axle than the static split."""
-    c, car = p["coefficient"], world.car
     rear_share = car.front_axle / car.wheelbase + 0.1
-
-    def press(now: Instant) -> None:
-        force = c * now.vx * now.vx
-        now.fz_f += (1.0 - rear_share) * force
-        now.fz_r += rear_share * force
-
-    world.hooks["load"].insert(0, press)
+    force = p["coefficient"] * now.vx * now.vx
+    now.fz_f += (1.0 - rear_share) * force
+    now.fz_r += rear_share * force
 
 
-def viscous_yaw(world: World, p: Parameters) -> None:
+@hook("body")
+def viscous_yaw(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Damping that grows a little with the yaw rate."""
-    c = p["coefficient"]
-
-    def resist(now: Instant) -> None:
-        now.moment -= c * now.r * (1.0 + 0.1 * abs(now.r))
-
-    world.hooks["body"].append(resist)
+    now.moment -= p["coefficient"] * now.r * (1.0 + 0.1 * abs(now.r))
 
 
-def torque_by_force(world: World, p: Parameters) -> None:
+@hook("body")
+def torque_by_force(now: Instant, p: Parameters, car: BaseCar) -> None:
     """The line of action of the axle force misses the centre of mass; the lever grows with the force."""
-    c, gain = p["coefficient"], world.car.drive_gain
-
-    def pull(now: Instant) -> None:
-        share = now.fx / gain
-        now.moment += c * share * (0.5 + abs(share))
-
-    world.hooks["body"].append(pull)
+    share = now.fx / car.drive_gain
+    now.moment += p["coefficient"] * share * (0.5 + abs(share))
 
 
-def gusty_side(world: World, p: Parameters) -> None:
+@hook("body")
+def gusty_side(now: Instant, p: Parameters, car: BaseCar) -> None:
     """A lateral bias force through the tyres, proportional to the axle loads, weak at standstill."""
-    force = p["force"]
-
-    def pull(now: Instant) -> None:
-        now.push_y += force * math.tanh(abs(now.vx) / 0.2)
-
-    world.hooks["body"].append(pull)
+    now.push_y += p["force"] * math.tanh(abs(now.vx) / 0.2)
 
 
-def bowl(world: World, p: Parameters) -> None:
+@hook("body")
+def bowl(now: Instant, p: Parameters, car: BaseCar) -> None:
     """A floor that rises along a line with increasing slope."""
-    weight, direction, angle = world.car.mass * GRAVITY_MPS2, p["direction"], p["angle"]
+    weight, direction, angle = car.mass * GRAVITY_MPS2, p["direction"], p["angle"]
     cos, sin = math.cos(direction), math.sin(direction)
+    force = weight * math.sin(angle * (1.0 + 0.08 * (now.x * cos + now.y * sin)))
+    now.push_x -= force * math.cos(direction - now.psi)
+    now.push_y -= force * math.sin(direction - now.psi)
 
-    def pull(now: Instant) -> None:
-        force = weight * math.sin(angle * (1.0 + 0.08 * (now.x * cos + now.y * sin)))
-        now.push_x -= force * math.cos(direction - now.psi)
-        now.push_y -= force * math.sin(direction - now.psi)
 
-    world.hooks["body"].append(pull)
+def force_limit(size: float, draw: Draw) -> dict[str, float]:
+    """A multiple of the largest drive force [N]."""
+    return {"force": draw.car.drive_gain / max(size, 1e-6)}
+
+
+def friction_share(size: float, draw: Draw) -> dict[str, float]:
+    """A multiple of the share of the rear axle's friction that the largest drive force needs."""
+    return {"share": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(size, 1e-6)}
+
+
+def drag_parameters(size: float, draw: Draw) -> dict[str, float]:
+    """Coefficient, and an exponent from 1.8 to 2.2."""
+    return {"coefficient": size, "exponent": 1.8 + 0.4 * draw.shares[0]}
 
 
 FORMS = (
-    Form(
-        "motor_saturation", "other", lambda s, draw: {"force": draw.car.drive_gain / max(s, 1e-6)}, soft_motor, 0.3, 3.0
-    ),
-    Form(
-        "traction_limit",
-        "other",
-        lambda s, draw: {"share": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(s, 1e-6)},
-        soft_traction,
-        0.3,
-        3.0,
-        fixed={"axle": "rear"},
-    ),
+    Form("motor_saturation", "other", force_limit, soft_motor, 0.3, 3.0),
+    Form("traction_limit", "other", friction_share, soft_traction, 0.3, 3.0, fixed={"axle": "rear"}),
     Form("battery_sag", "other", plain("rate"), charge_sag, 0.0004, 0.008),
     Form("brake_asymmetry", "other", factor("gain_ratio"), soft_brake, 0.1, 1.5),
     Form("rolling_resistance", "other", plain("force"), stribeck, 0.05, 2.0),
-    Form(
-        "aerodynamic_drag",
-        "other",
-        lambda s, draw: {"coefficient": s, "exponent": 1.8 + 0.4 * draw.shares[0]},
-        powered_drag,
-        0.05,
-        1.5,
-    ),
+    Form("aerodynamic_drag", "other", drag_parameters, powered_drag, 0.05, 1.5),
     Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
     Form("tyre_saturation", "other", saturating, brush_tyre, 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
-    Form(
-        "longitudinal_slip",
-        "other",
-        slipping,
-        brush_slip,
-        1.0,
-        8.0,
-        smallest=0.5,
-    ),
+    Form("longitudinal_slip", "other", slipping, brush_slip, 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),
     Form("load_transfer", "other", plain("height"), pitching, 0.02, 0.2),
     Form("friction_drift", "other", signed("rate"), settling_grip, 0.0006, 0.007),
@@ -291,12 +223,5 @@ FORMS = (
     Form("yaw_damping", "other", plain("coefficient"), viscous_yaw, 0.005, 0.5),
     Form("torque_steer", "other", signed("coefficient"), torque_by_force, 0.01, 0.6),
     Form("lateral_bias", "other", signed("force"), gusty_side, 0.1, 3.0),
-    Form(
-        "road_slope",
-        "other",
-        lambda s, draw: {"angle": s, "direction": math.pi * (2.0 * draw.shares[0] - 1.0)},
-        bowl,
-        0.005,
-        0.2,
-    ),
+    Form("road_slope", "other", heading("angle", "direction"), bowl, 0.005, 0.2),
 )

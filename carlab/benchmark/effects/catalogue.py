@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -9,9 +10,10 @@ from typing import Literal
 import numpy as np
 
 from carlab.benchmark.world.base_car import BaseCar
-from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.physics import Instant, World
 
 Parameters = Mapping[str, float]
+Attach = Callable[[World, Parameters], None]
 FormName = Literal["catalogue", "other", "outside", "random"]
 
 # Confusable effects of each effect.
@@ -107,13 +109,31 @@ class Form:
     id: str
     form: FormName
     sized: Callable[[float, Draw], dict[str, float]]
-    attach: Callable[[World, Parameters], None]
+    attach: Attach
     typical: float
     largest: float
     fixed: Mapping[str, str] | None = None
     nominal_kind: Literal["dynamic", "linear_tyre"] = "dynamic"
     class_words: tuple[tuple[str, ...], ...] = ()
     smallest: float = 0.0
+
+
+def hook(stage: str, *, first: bool = False) -> Callable[[Callable[[Instant, Parameters, BaseCar], None]], Attach]:
+    """Decorate an effect without states of its own, which changes the variables of ``stage`` (see ``Instant``).
+
+    Args:
+        stage: stage of the equations of motion.
+        first: the effect comes before the other effects of the stage.
+    """
+
+    def decorate(change: Callable[[Instant, Parameters, BaseCar], None]) -> Attach:
+        def attach(world: World, p: Parameters) -> None:
+            hooks = world.hooks[stage]
+            hooks.insert(0 if first else len(hooks), lambda now: change(now, p, world.car))
+
+        return attach
+
+    return decorate
 
 
 def plain(key: str) -> Callable[[float, Draw], dict[str, float]]:
@@ -129,6 +149,11 @@ def signed(key: str) -> Callable[[float, Draw], dict[str, float]]:
 def inverse(key: str) -> Callable[[float, Draw], dict[str, float]]:
     """The parameter is one over the size: identity at infinity."""
     return lambda size, draw: {key: 1.0 / max(size, 1e-9)}
+
+
+def heading(key: str, angle_key: str) -> Callable[[float, Draw], dict[str, float]]:
+    """The size, and a random heading [rad]."""
+    return lambda size, draw: {key: size, angle_key: math.pi * (2.0 * draw.shares[0] - 1.0)}
 
 
 def factor(key: str) -> Callable[[float, Draw], dict[str, float]]:

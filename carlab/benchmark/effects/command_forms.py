@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from carlab.benchmark.effects.catalogue import Form, Parameters, factor, inverse, plain, signed
+from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, hook, inverse, plain, signed
+from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.physics import Hook, Instant, World
 
 
@@ -103,14 +104,10 @@ def steering_backlash(world: World, p: Parameters) -> None:
     world.steering_maps.append(follow)
 
 
-def steering_offset(world: World, p: Parameters) -> None:
+@hook("steer")
+def steering_offset(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Trim: constant offset angle."""
-    angle = p["angle"]
-
-    def trim(now: Instant) -> None:
-        now.d += angle
-
-    world.hooks["steer"].append(trim)
+    now.d += p["angle"]
 
 
 def steering_asymmetry(world: World, p: Parameters) -> None:
@@ -138,15 +135,13 @@ def throttle_nonlinearity(world: World, p: Parameters) -> None:
     world.throttle_maps.append(lambda u: math.copysign(abs(u) ** exponent, u))
 
 
+def extra_delay(size: float, draw: Draw) -> dict[str, float]:
+    """An additional delay [s] of either sign that leaves a twentieth of the delay of the car file."""
+    return {"extra_delay": max(draw.sign * size, -0.95 * draw.car.command_delay)}
+
+
 FORMS = (
-    Form(
-        "command_delay",
-        "catalogue",
-        lambda size, draw: {"extra_delay": max(draw.sign * size, -0.95 * draw.car.command_delay)},
-        command_delay,
-        0.01,
-        0.15,
-    ),
+    Form("command_delay", "catalogue", extra_delay, command_delay, 0.01, 0.15),
     Form("steering_delay", "catalogue", plain("delay"), steering_delay, 0.01, 0.2),
     Form("throttle_delay", "catalogue", plain("delay"), throttle_delay, 0.03, 0.4),
     Form("steering_lag", "catalogue", plain("time_constant"), steering_lag, 0.01, 0.4),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, plain, signed
-from carlab.benchmark.world.base_car import GRAVITY_MPS2
-from carlab.benchmark.world.physics import Hook, Instant, World, pacejka_shape
+from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, hook, plain, signed
+from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
+from carlab.benchmark.world.physics import Instant, World, pacejka_shape
 
 WHEEL_RADIUS_M = 0.033  # the catalogue and the car file give none; that of a 1:10 touring car
 
@@ -27,8 +27,13 @@ def saturating(size: float, draw: Draw) -> dict[str, float]:
 
 def tyre_saturation(world: World, p: Parameters) -> None:
     """The magic formula instead of the linear tyre of the car file."""
-    world.shape_front = pacejka_shape(p["B_front"], p["C_front"])
-    world.shape_rear = pacejka_shape(p["B_rear"], p["C_rear"])
+    replace_tyres(world, p, pacejka_shape)
+
+
+def replace_tyres(world: World, p: Parameters, shape: Callable[[float, float], Callable[[float], float]]) -> None:
+    """Other tyres on both axles: a curve by B and C, and their friction."""
+    world.shape_front = shape(p["B_front"], p["C_front"])
+    world.shape_rear = shape(p["B_rear"], p["C_rear"])
 
     def grip(now: Instant) -> None:
         now.mu_f, now.mu_r = p["mu_front"], p["mu_rear"]
@@ -36,15 +41,11 @@ def tyre_saturation(world: World, p: Parameters) -> None:
     world.hooks["grip"].insert(0, grip)
 
 
-def friction_ellipse(world: World, p: Parameters) -> None:
+@hook("tyre")
+def friction_ellipse(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Longitudinal force at the rear axle reduces its side force."""
-    scale = p["scale"]
-
-    def share(now: Instant) -> None:
-        used = min(max(scale * now.fx / (now.mu_r * now.fz_r), -0.98), 0.98)
-        now.fr *= math.sqrt(1.0 - used * used)
-
-    world.hooks["tyre"].append(share)
+    used = min(max(p["scale"] * now.fx / (now.mu_r * now.fz_r), -0.98), 0.98)
+    now.fr *= math.sqrt(1.0 - used * used)
 
 
 def longitudinal_slip(world: World, p: Parameters) -> None:
@@ -86,18 +87,15 @@ def tyre_relaxation(world: World, p: Parameters) -> None:
     world.hooks["tyre"].append(relax)
 
 
-def load_transfer(world: World, p: Parameters) -> None:
+@hook("load")
+def load_transfer(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Load moves to the rear with m ax h / L; ax holds all tyre forces (solved exactly: they are linear in load)."""
-    ratio = p["height"] / world.car.wheelbase
-
-    def shift(now: Instant) -> None:
-        drag = now.mu_f * now.shape_f * now.sin_d  # -F_front sin d = drag * F_z,front
-        front = (now.fz_f - ratio * now.fx) / (1.0 + ratio * drag)
-        total = now.fz_f + now.fz_r
-        now.fz_f = min(max(front, 0.02 * total), 0.98 * total)
-        now.fz_r = total - now.fz_f
-
-    world.hooks["load"].append(shift)
+    ratio = p["height"] / car.wheelbase
+    drag = now.mu_f * now.shape_f * now.sin_d  # -F_front sin d = drag * F_z,front
+    front = (now.fz_f - ratio * now.fx) / (1.0 + ratio * drag)
+    total = now.fz_f + now.fz_r
+    now.fz_f = min(max(front, 0.02 * total), 0.98 * total)
+    now.fz_r = total - now.fz_f
 
 
 def roll_dynamics(world: World, p: Parameters) -> None:
@@ -119,44 +117,29 @@ def roll_dynamics(world: World, p: Parameters) -> None:
     world.hooks["tyre"].append(roll)
 
 
-def friction_drift(world: World, p: Parameters) -> None:
+@hook("grip")
+def friction_drift(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Grip of both axles drifts with time since the first row."""
     rate = p["rate"]
-
-    def drift(now: Instant) -> None:
-        now.mu_f *= 1.0 + rate * now.t
-        now.mu_r *= 1.0 + rate * now.t
-
-    world.hooks["grip"].append(drift)
+    now.mu_f *= 1.0 + rate * now.t
+    now.mu_r *= 1.0 + rate * now.t
 
 
-def patch_hook(p: Parameters) -> Hook:
-    """Reduced grip while the centre of mass is inside a disc."""
-    x, y, radius, kept = p["x"], p["y"], p["radius"], 1.0 - p["loss"]
-
-    def slip(now: Instant) -> None:
-        if (now.x - x) ** 2 + (now.y - y) ** 2 < radius * radius:
-            now.mu_f *= kept
-            now.mu_r *= kept
-
-    return slip
+@hook("grip")
+def low_friction_patch(now: Instant, p: Parameters, car: BaseCar) -> None:
+    """A disc of low friction on the floor, on which the centre of mass is."""
+    if (now.x - p["x"]) ** 2 + (now.y - p["y"]) ** 2 < p["radius"] * p["radius"]:
+        now.mu_f *= 1.0 - p["loss"]
+        now.mu_r *= 1.0 - p["loss"]
 
 
-def low_friction_patch(world: World, p: Parameters) -> None:
-    """A disc of low friction on the floor."""
-    world.hooks["grip"].append(patch_hook(p))
-
-
-def aerodynamic_downforce(world: World, p: Parameters) -> None:
+@hook("load", first=True)
+def aerodynamic_downforce(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Load grows with speed squared, split like the static loads."""
-    c = p["coefficient"] / (world.car.mass * GRAVITY_MPS2)
-
-    def press(now: Instant) -> None:
-        more = 1.0 + c * now.vx * now.vx
-        now.fz_f *= more
-        now.fz_r *= more
-
-    world.hooks["load"].insert(0, press)
+    c = p["coefficient"] / (car.mass * GRAVITY_MPS2)
+    more = 1.0 + c * now.vx * now.vx
+    now.fz_f *= more
+    now.fz_r *= more
 
 
 def placed(size: float, draw: Draw) -> dict[str, float]:
@@ -169,32 +152,18 @@ def slipping(size: float, draw: Draw) -> dict[str, float]:
     return {"inertia": 2e-4 * size, "stiffness": 40.0 / max(size, 1e-9)}
 
 
+def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
+    """Natural frequency [Hz], damping ratio and loss of grip."""
+    return {"frequency": 1.5 + 2.5 * draw.shares[0], "damping": 0.2 + 0.4 * draw.shares[1], "loss": size}
+
+
 FORMS = (
     Form("tyre_saturation", "catalogue", saturating, tyre_saturation, 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
-    Form(
-        "longitudinal_slip",
-        "catalogue",
-        slipping,
-        longitudinal_slip,
-        1.0,
-        8.0,
-        smallest=0.5,
-    ),
+    Form("longitudinal_slip", "catalogue", slipping, longitudinal_slip, 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),
     Form("load_transfer", "catalogue", plain("height"), load_transfer, 0.02, 0.2),
-    Form(
-        "roll_dynamics",
-        "other",
-        lambda size, draw: {
-            "frequency": 1.5 + 2.5 * draw.shares[0],
-            "damping": 0.2 + 0.4 * draw.shares[1],
-            "loss": size,
-        },
-        roll_dynamics,
-        0.3,
-        4.0,
-    ),
+    Form("roll_dynamics", "other", roll_parameters, roll_dynamics, 0.3, 4.0),
     Form("friction_drift", "catalogue", signed("rate"), friction_drift, 0.0006, 0.007),
     Form("low_friction_patch", "catalogue", placed, low_friction_patch, 0.3, 0.9),
     Form("aerodynamic_downforce", "catalogue", plain("coefficient"), aerodynamic_downforce, 0.2, 6.0),

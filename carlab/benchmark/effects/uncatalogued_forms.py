@@ -9,45 +9,36 @@ import math
 
 import numpy as np
 
-from carlab.benchmark.effects.catalogue import Form, FormName, Parameters, plain, signed
+from carlab.benchmark.effects.catalogue import Draw, Form, FormName, Parameters, heading, hook, plain, signed
+from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.physics import Instant, World
 from carlab.benchmark.world.simulation import FloatArray
 
 OUTSIDE: FormName = "outside"
 
 
-def wind(world: World, p: Parameters) -> None:
+@hook("body")
+def wind(now: Instant, p: Parameters, car: BaseCar) -> None:
     """A steady wind over the floor: drag of the air's speed less that in still air."""
     c, speed, heading = 0.15, p["speed"], p["heading"]
-
-    def blow(now: Instant) -> None:
-        air_x = now.vx - speed * math.cos(heading - now.psi)
-        air_y = now.vy - speed * math.sin(heading - now.psi)
-        fast, still = math.hypot(air_x, air_y), math.hypot(now.vx, now.vy)
-        now.push_x -= c * (fast * air_x - still * now.vx)
-        now.push_y -= 2.0 * c * (fast * air_y - still * now.vy)
-
-    world.hooks["body"].append(blow)
+    air_x = now.vx - speed * math.cos(heading - now.psi)
+    air_y = now.vy - speed * math.sin(heading - now.psi)
+    fast, still = math.hypot(air_x, air_y), math.hypot(now.vx, now.vy)
+    now.push_x -= c * (fast * air_x - still * now.vx)
+    now.push_y -= 2.0 * c * (fast * air_y - still * now.vy)
 
 
-def camber(world: World, p: Parameters) -> None:
+@hook("tyre")
+def camber(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Toe and camber: side force of the front axle alone, in proportion to its load."""
-    force = p["share"] * world.car.load_front
-
-    def push(now: Instant) -> None:
-        now.ff += force * math.tanh(abs(now.vx) / 0.2)
-
-    world.hooks["tyre"].append(push)
+    force = p["share"] * car.load_front
+    now.ff += force * math.tanh(abs(now.vx) / 0.2)
 
 
-def locked_differential(world: World, p: Parameters) -> None:
+@hook("body")
+def locked_differential(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Two rear wheels of one speed: a moment that falls with speed, -k r / max(|vx|, 0.3)."""
-    k = p["moment"]
-
-    def resist(now: Instant) -> None:
-        now.moment -= k * math.tanh(now.r / max(abs(now.vx), 0.3))
-
-    world.hooks["body"].append(resist)
+    now.moment -= p["moment"] * math.tanh(now.r / max(abs(now.vx), 0.3))
 
 
 def warm_up(world: World, p: Parameters) -> None:
@@ -96,19 +87,16 @@ def scale_error(world: World, p: Parameters) -> None:
     world.pose_changes.append(stretch)
 
 
-def cable(world: World, p: Parameters) -> None:
+@hook("body")
+def cable(now: Instant, p: Parameters, car: BaseCar) -> None:
     """A cable that pulls the car's tail towards a point like a soft spring."""
-    k, x, y, car = p["stiffness"], p["x"], p["y"], world.car
-
-    def pull(now: Instant) -> None:
-        cos, sin = math.cos(now.psi), math.sin(now.psi)
-        dx, dy = x - (now.x - car.rear_axle * cos), y - (now.y - car.rear_axle * sin)
-        along, across = k * (dx * cos + dy * sin), k * (dy * cos - dx * sin)
-        now.push_x += along
-        now.push_y += across
-        now.moment -= car.rear_axle * across
-
-    world.hooks["body"].append(pull)
+    k, x, y = p["stiffness"], p["x"], p["y"]
+    cos, sin = math.cos(now.psi), math.sin(now.psi)
+    dx, dy = x - (now.x - car.rear_axle * cos), y - (now.y - car.rear_axle * sin)
+    along, across = k * (dx * cos + dy * sin), k * (dy * cos - dx * sin)
+    now.push_x += along
+    now.push_y += across
+    now.moment -= car.rear_axle * across
 
 
 def motor_hysteresis(world: World, p: Parameters) -> None:
@@ -153,27 +141,21 @@ def sagging_servo(world: World, p: Parameters) -> None:
     world.hooks["steer"].append(servo)
 
 
-def bumpy_floor(world: World, p: Parameters) -> None:
+@hook("body")
+def bumpy_floor(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Joints between floor plates every 0.8 m that brake the car."""
-    force = p["force"]
+    joint = math.cos(math.pi * now.x / 0.8) ** 8 + math.cos(math.pi * now.y / 0.8) ** 8
+    now.push_x -= p["force"] * joint * math.tanh(now.vx / 0.05)
 
-    def hold(now: Instant) -> None:
-        joint = math.cos(math.pi * now.x / 0.8) ** 8 + math.cos(math.pi * now.y / 0.8) ** 8
-        now.push_x -= force * joint * math.tanh(now.vx / 0.05)
 
-    world.hooks["body"].append(hold)
+def cable_parameters(size: float, draw: Draw) -> dict[str, float]:
+    """Stiffness of the cable [N/m], and its fixed end within 1 m of the origin in x and y."""
+    return {"stiffness": size, "x": 2.0 * draw.shares[0] - 1.0, "y": 2.0 * draw.shares[1] - 1.0}
 
 
 FORMS = (
-    Form(
-        "wind",
-        OUTSIDE,
-        lambda s, draw: {"speed": s, "heading": math.pi * (2.0 * draw.shares[0] - 1.0)},
-        wind,
-        0.3,
-        8.0,
-        class_words=(("heading", "direction", "world", "wind"),),
-    ),
+    Form("wind", OUTSIDE, heading("speed", "heading"), wind, 0.3, 8.0,
+         class_words=(("heading", "direction", "world", "wind"),)),
     Form("camber", OUTSIDE, signed("share"), camber, 0.01, 0.4,
          class_words=(("constant", "even", "bias", "steering"),)),
     Form("locked_differential", OUTSIDE, plain("moment"), locked_differential, 0.02, 2.0,
@@ -185,15 +167,7 @@ FORMS = (
     Form("command_quantisation", OUTSIDE, plain("step"), quantised, 0.03, 0.5, class_words=(("steering",),)),
     Form("mocap_scale", OUTSIDE, signed("scale"), scale_error, 0.003, 0.2,
          class_words=(("speed", "proportion", "scale", "gain"),)),
-    Form(
-        "cable_pull",
-        OUTSIDE,
-        lambda s, draw: {"stiffness": s, "x": 2.0 * draw.shares[0] - 1.0, "y": 2.0 * draw.shares[1] - 1.0},
-        cable,
-        0.02,
-        1.0,
-        class_words=(("place", "position", "location"),),
-    ),
+    Form("cable_pull", OUTSIDE, cable_parameters, cable, 0.02, 1.0, class_words=(("place", "position", "location"),)),
     Form("motor_hysteresis", OUTSIDE, plain("width"), motor_hysteresis, 0.03, 0.6,
          class_words=(("throttle", "history", "hysteresis", "state"),)),
     Form("compliance_steer", OUTSIDE, plain("softness"), compliance_steer, 0.005, 0.15,
