@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from carlab.benchmark import CaseSpec, Proof
+from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.proof.calibration import calibrate, passes
+from carlab.benchmark.proof.runner import Proof
 from carlab.cli import run
 
 CHI2, SHARE = "selection.accept_chi2_min", "selection.accept_left_out_share"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.core.quantities import FloatArray

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import carlab
-from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.proof.calibration import passes
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cli import run

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlab.benchmark import make_case
-from carlab.benchmark.cases.case import Case
+from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import carlab
-from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.diagnosis.identification.fit import Fit, Scale, huber

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlab.benchmark import make_case
-from carlab.benchmark.cases.case import Case
+from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.world.driver import HumanDriver, Track
 from carlab.benchmark.world.measurement import Noise, as_table, record, write_csv
 from carlab.benchmark.world.physics import World

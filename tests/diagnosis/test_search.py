@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from carlab.benchmark import make_case
-from carlab.benchmark.cases.case import Case
+from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.core.clock import SimulatedClock

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlab.benchmark import make_case
-from carlab.benchmark.cases.case import Case, CaseKind
+from carlab.benchmark.cases.case import Case, CaseKind, make_case
 from carlab.benchmark.effects.catalogue import FormName
 from carlab.benchmark.effects.random_physics import MonotoneMap
 from carlab.benchmark.world.measurement import write_csv
