@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import savgol_filter
 
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, FloatArray
@@ -71,23 +72,9 @@ def window_rows(window_s: float, gap_s: float) -> int:
 
 
 def local_fit(values: FloatArray, window: int, order: int, gap_s: float) -> tuple[FloatArray, FloatArray]:
-    """Value and slope of a local polynomial (Savitzky and Golay) at every row of (N, k); narrower ones at the ends."""
-    half = window // 2
-    count = len(values)
-    grid = np.arange(window)
-    fitted, slope = np.empty_like(values), np.empty_like(values)
-    for offset in range(window):
-        powers = np.vander((grid - offset).astype(np.float64), order + 1, increasing=True)
-        weights = np.linalg.pinv(powers)
-        if offset == half:
-            for k in range(values.shape[1]):
-                fitted[half : count - half, k] = np.convolve(values[:, k], weights[0][::-1], "valid")
-                slope[half : count - half, k] = np.convolve(values[:, k], weights[1][::-1], "valid")
-        else:
-            first, row = (0, offset) if offset < half else (count - window, count - window + offset)
-            fitted[row] = weights[0] @ values[first : first + window]
-            slope[row] = weights[1] @ values[first : first + window]
-    return fitted, slope / gap_s
+    """Value and slope of a local polynomial (Savitzky and Golay) at every row of (N, k); off-centre at the ends."""
+    fitted, slope = (savgol_filter(values, window, order, deriv=k, delta=gap_s, axis=0) for k in (0, 1))
+    return fitted, slope
 
 
 def to_body(yaw: FloatArray, slope: FloatArray) -> FloatArray:
