@@ -165,8 +165,8 @@ def _tables(
     tables, described = [as_table(r) for r in recordings], None
     if fault is not None:
         done = [FAULTS[fault](t, np.random.default_rng((scene.seed, 4)), scene.nominal) for t in tables]
-        tables = [t for t, _ in done]
-        described = {"id": fault, "columns": list(done[0][1].columns), "rows": done[0][1].rows}
+        tables = [table for table, *_ in done]
+        described = {"id": fault, "columns": list(done[0][1]), "rows": done[0][2]}
     if conditions.stamp_delay_periods > 0.0:
         period_s = scene.nominal.control_period
         mean_s = conditions.stamp_delay_periods * period_s
