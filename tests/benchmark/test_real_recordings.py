@@ -70,7 +70,7 @@ def with_effect(kind: Kind, truth: Sequence[Truth]) -> SimulatorConfig:
 @pytest.mark.parametrize("kind", [k for k in KINDS if k.id not in LAGS], ids=lambda k: k.id)
 def test_recording_is_that_of_a_car_with_the_effect(kind: Kind) -> None:
     """The effect-free car's recording with transformed columns is reproduced by a simulated car with the effect."""
-    change = kind.apply(simulated(commands(12.0)), kind.sizes[1], 0.3)
+    change = kind.change(simulated(commands(12.0)), kind.sizes[1], 0.3)
     sent = np.stack([change.table["steering"], change.table["throttle"]], axis=1)[:-1]
     assert np.abs(sent).max() <= 1.0
     expected = simulated(sent, with_effect(kind, change.truth))
@@ -85,7 +85,7 @@ def test_recording_is_that_of_a_car_with_the_effect(kind: Kind) -> None:
 def test_lag_leaves_a_fifteenth_of_its_effect(name: str) -> None:
     """Compare with the error of the untransformed recording against the car with the lag."""
     plain = simulated(commands(12.0))
-    change = BY_ID[name].apply(plain, BY_ID[name].sizes[1], 0.3)
+    change = BY_ID[name].change(plain, BY_ID[name].sizes[1], 0.3)
     car = with_effect(BY_ID[name], change.truth)
     sent = np.stack([change.table["steering"], change.table["throttle"]], axis=1)[:-1]
     column = "yaw_rate" if name == "steering_lag" else "vx"
@@ -97,7 +97,7 @@ def test_lag_leaves_a_fifteenth_of_its_effect(name: str) -> None:
 def test_lag_reports_commands_that_it_clips() -> None:
     table = simulated(commands(12.0))
     table["steering"] = FULL_LOCK * np.sign(table["steering"])
-    change = BY_ID["steering_lag"].apply(table, 0.1, 0.3)
+    change = BY_ID["steering_lag"].change(table, 0.1, 0.3)
     assert np.abs(change.table["steering"]).max() <= 1.0
     assert change.inexact > 0.1
 
@@ -259,7 +259,7 @@ def test_size_of_the_other_correct_name_is_added_to_its_own_parameter() -> None:
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.id)
 def test_identity_of_a_kind_is_that_of_the_catalogue(kind: Kind) -> None:
     parameters = [p for name in kind.names if name in CATALOGUE for p in CATALOGUE[name].parameters]
-    changed = {truth.parameter for truth in kind.apply(simulated(commands(12.0)), kind.sizes[0], 0.3).truth}
+    changed = {truth.parameter for truth in kind.change(simulated(commands(12.0)), kind.sizes[0], 0.3).truth}
     for parameter in parameters:
         if parameter.name in changed and parameter.identity is not None:
             assert kind.identity == parameter.identity

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import secrets
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from carlab.benchmark.cases.proof_set import CaseSpec
-from carlab.benchmark.cases.seal import check, digest, new_nonce
+from carlab.benchmark.cases.seal import check, digest
 from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.case_score import score_case, valid_set
 from carlab.benchmark.proof.detection import spurious_curves
@@ -209,12 +210,12 @@ def test_summary_table_and_pictures(tmp_path: Path) -> None:
 
 def test_seal_detects_any_change() -> None:
     answers = {"aa": answer(), "bb": answer("null")}
-    nonce = new_nonce()
+    nonce = secrets.token_hex(32)
     sealed = digest(answers, nonce)
     check(answers, nonce, sealed)
     changed = copy.deepcopy(answers)
     changed["aa"]["effects"][0]["parameters"]["time_constant"] += 1e-12
-    for wrong, key in ((changed, nonce), (answers, new_nonce()), ({"aa": answers["aa"]}, nonce)):
+    for wrong, key in ((changed, nonce), (answers, secrets.token_hex(32)), ({"aa": answers["aa"]}, nonce)):
         with pytest.raises(DataError, match="seal is broken"):
             check(wrong, key, sealed)
 

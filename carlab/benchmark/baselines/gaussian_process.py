@@ -12,22 +12,16 @@ import numpy as np
 
 from carlab.benchmark.baselines.data import Prepared, Steps, held_out_score
 from carlab.benchmark.world.simulation import FloatArray
-from carlab.core.errors import ConfigError
-from carlab.core.extras import install_hint
 
 POINTS = 400
 TUNED_ON = 150
 
 
 def gp_score(data: Prepared) -> float:
-    """Held-out score of the refitted model with the process's mean added. Raises ConfigError without scikit-learn."""
-    try:
-        from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-    except ImportError as error:
-        raise ConfigError(
-            f"The Gaussian process baseline needs scikit-learn; {install_hint('studies')}. Or use --no-baselines."
-        ) from error
+    """Held-out score of the refitted model with the process's mean added."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     inputs = _inputs(data.steps)
     centre, spread = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
     rows = np.linspace(0, len(inputs) - 1, min(POINTS, len(inputs))).round().astype(np.int64)

@@ -10,6 +10,7 @@ both name an effect in nearly every null case.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,6 @@ import numpy as np
 from carlab.benchmark.baselines.data import Prepared, Steps, held_out_score
 from carlab.benchmark.baselines.terms import AT_END_ONLY, Term, effect_of, library
 from carlab.benchmark.world.simulation import FloatArray
-from carlab.core.errors import ConfigError
-from carlab.core.extras import install_hint
 
 THRESHOLDS = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
 MIN_SCORE_FALL = 0.03
@@ -73,13 +72,9 @@ class System:
 
 
 def pysindy_regression(system: System) -> FloatArray:
-    """Coefficients (K,) by PySINDy. Raises ConfigError if it is not installed."""
-    try:
-        import pysindy
-    except ImportError as error:
-        raise ConfigError(
-            f"The PySINDy baseline needs pysindy; {install_hint('studies')}. Or use --no-baselines."
-        ) from error
+    """Coefficients (K,) by PySINDy."""
+    import pysindy
+
     lengths = np.maximum(np.linalg.norm(system.fit_x, axis=0), 1e-9)
     unit = max(float(np.linalg.norm(system.fit_y)), 1e-9)
     found = []
@@ -100,8 +95,6 @@ def pysindy_regression(system: System) -> FloatArray:
 
 
 def _quietly(solver: object, x: FloatArray, y: FloatArray) -> FloatArray:
-    import warnings
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "sparsity parameter is too big": the coefficients are then zero
         solver.fit(x, y)  # type: ignore[attr-defined]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -43,15 +42,6 @@ class Conditions:
     def implied_effects(self) -> tuple[str, ...]:
         """Effects that a wrong car file lacks whatever is concealed: linear tyres and wheels without slip saturate."""
         return () if self.base_model == "same" else ("tyre_saturation",)
-
-    def as_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Conditions:
-        """Read ``as_dict``."""
-        return cls(**values)
 
 
 def with_stamp_delays(table: Table, mean_s: float, period_s: float, rng: np.random.Generator) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -43,18 +43,7 @@ class CaseSpec:
 
     def make(self) -> Case:
         """Draw, size and record the case."""
-        return make_case(
-            self.kind,
-            self.seed,
-            effects=self.effects,
-            form=self.form,
-            excess=self.excess,
-            fault=self.fault,
-            period_s=self.period_s,
-            fit_s=self.fit_s,
-            hold_s=self.hold_s,
-            conditions=self.conditions,
-        )
+        return make_case(**vars(self))
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON, without conditions that are those of the full set."""
@@ -66,7 +55,7 @@ class CaseSpec:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> CaseSpec:
         """Read ``as_dict``."""
-        conditions = Conditions.from_dict(values.get("conditions", {}))
+        conditions = Conditions(**values.get("conditions", {}))
         return cls(**{**values, "effects": tuple(values["effects"]), "conditions": conditions})
 
 
@@ -96,7 +85,7 @@ def short_set(
 ) -> list[CaseSpec]:
     """A few short cases of each kind."""
     specs = _specs(purpose, seed, per_effect=1, nulls=2, pairs=0, outside=1, per_fault=0, effects=effects)
-    return [CaseSpec(s.kind, s.seed, s.effects, s.form, s.excess, s.fault, s.period_s, 40.0, 20.0) for s in specs]
+    return [replace(spec, fit_s=40.0, hold_s=20.0) for spec in specs]
 
 
 def drawn(specs: list[Spec], count: int, seed: int = 0) -> list[Spec]:

@@ -12,16 +12,6 @@ from typing import Any
 from carlab.core.errors import DataError
 
 
-def new_nonce() -> str:
-    """32 random bytes as hex."""
-    return secrets.token_hex(32)
-
-
-def new_name() -> str:
-    """A random name for a case's folder."""
-    return secrets.token_hex(8)
-
-
 def digest(answers: Mapping[str, Any], nonce: str) -> str:
     """sha256 over the nonce and the answers as canonical JSON (sorted keys, no spaces), as hex."""
     text = json.dumps({"nonce": nonce, "answers": answers}, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -27,49 +27,42 @@ from carlab.benchmark.world.simulation import FloatArray
 STANDARD_ERRORS = 2.0
 
 
-def _lag(channel: int) -> Callable[[float, BaseCar], CommandChange]:
-    def change(value: float, car: BaseCar) -> CommandChange:
-        def smooth(series: FloatArray, steps_s: FloatArray) -> FloatArray:
-            out = series.copy()
-            lag, state = max(value, 1e-4), 0.0
-            for k, (wanted, step_s) in enumerate(zip(series[:, channel].tolist(), steps_s.tolist(), strict=True)):
-                kept = np.exp(-step_s / lag)
-                out[k, channel] = wanted + (state - wanted) * lag / step_s * (1.0 - kept)
-                state = wanted + (state - wanted) * kept
-            return out
-
-        return smooth
-
-    return change
+# Change of (steering and throttle (n, 2), step lengths (n,) [s]) by the parameter of an effect, for a car.
+SizedChange = Callable[[FloatArray, FloatArray, float, BaseCar], FloatArray]
 
 
-def _map(
-    channel: int, function: Callable[[FloatArray, float, BaseCar], FloatArray]
-) -> Callable[[float, BaseCar], CommandChange]:
-    def change(value: float, car: BaseCar) -> CommandChange:
-        def apply(series: FloatArray, steps_s: FloatArray) -> FloatArray:
-            out = series.copy()
-            out[:, channel] = function(series[:, channel], value, car)
-            return out
+def _lag(channel: int) -> SizedChange:
+    def smooth(series: FloatArray, steps_s: FloatArray, value: float, car: BaseCar) -> FloatArray:
+        out = series.copy()
+        lag, state = max(value, 1e-4), 0.0
+        for k, (wanted, step_s) in enumerate(zip(series[:, channel].tolist(), steps_s.tolist(), strict=True)):
+            kept = np.exp(-step_s / lag)
+            out[k, channel] = wanted + (state - wanted) * lag / step_s * (1.0 - kept)
+            state = wanted + (state - wanted) * kept
+        return out
 
-        return apply
-
-    return change
+    return smooth
 
 
-def _late(channels: tuple[int, ...]) -> Callable[[float, BaseCar], CommandChange]:
-    def change(value: float, car: BaseCar) -> CommandChange:
-        def shift(series: FloatArray, steps_s: FloatArray) -> FloatArray:
-            edges = np.concatenate([[0.0], np.cumsum(steps_s)])
-            out = series.copy()
-            for k in channels:
-                whole = np.concatenate([[0.0], np.cumsum(series[:, k] * steps_s)])
-                out[:, k] = np.diff(np.interp(edges - value, edges, whole)) / steps_s
-            return out
+def _map(channel: int, function: Callable[[FloatArray, float, BaseCar], FloatArray]) -> SizedChange:
+    def apply(series: FloatArray, steps_s: FloatArray, value: float, car: BaseCar) -> FloatArray:
+        out = series.copy()
+        out[:, channel] = function(series[:, channel], value, car)
+        return out
 
-        return shift
+    return apply
 
-    return change
+
+def _late(channels: tuple[int, ...]) -> SizedChange:
+    def shift(series: FloatArray, steps_s: FloatArray, value: float, car: BaseCar) -> FloatArray:
+        edges = np.concatenate([[0.0], np.cumsum(steps_s)])
+        out = series.copy()
+        for k in channels:
+            whole = np.concatenate([[0.0], np.cumsum(series[:, k] * steps_s)])
+            out[:, k] = np.diff(np.interp(edges - value, edges, whole)) / steps_s
+        return out
+
+    return shift
 
 
 def _deadband(u: FloatArray, width: float, car: BaseCar) -> FloatArray:
@@ -78,7 +71,7 @@ def _deadband(u: FloatArray, width: float, car: BaseCar) -> FloatArray:
 
 
 # By effect: change of the acting commands, and range of its parameter.
-CHEAP: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, float]]] = {
+CHEAP: dict[str, tuple[SizedChange, tuple[float, float]]] = {
     "command_delay": (_late((0, 1)), (-0.03, 0.15)),
     "mocap_latency": (_late((0, 1)), (-0.03, 0.15)),
     "steering_delay": (_late((0,)), (0.0, 0.2)),
@@ -91,6 +84,12 @@ CHEAP: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, f
     "throttle_deadband": (_map(1, lambda u, v, car: np.sign(u) * np.maximum(np.abs(u) - v, 0) / (1 - v)), (0.0, 0.3)),
     "throttle_nonlinearity": (_map(1, lambda u, v, car: np.sign(u) * np.abs(u) ** v), (0.4, 2.5)),
 }
+
+
+def command_change(name: str, value: float, car: BaseCar) -> CommandChange:
+    """The change of the acting commands by an effect of CHEAP with a value of its parameter."""
+    change = CHEAP[name][0]
+    return lambda series, steps_s: change(series, steps_s, value, car)
 
 
 def indistinguishable(
@@ -123,11 +122,11 @@ def indistinguishable(
 
 
 def _window_losses(name: str, nominal: BaseCar, recordings: list[Recording], floor: FloatArray) -> FloatArray:
-    build, bounds = CHEAP[name]
+    _, bounds = CHEAP[name]
 
     def cut(value: float) -> list[Windows]:
-        windows = [cut_windows(r, nominal, every_s=1.0, changes=[build(value, nominal)]) for r in recordings]
-        return [s.with_floor(floor) for s in windows]
+        changes = [command_change(name, value, nominal)]
+        return [cut_windows(r, nominal, every_s=1.0, changes=changes).with_floor(floor) for r in recordings]
 
     def cost(value: float) -> float:
         windows = cut(value)

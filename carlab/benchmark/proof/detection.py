@@ -12,7 +12,7 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from carlab.benchmark.intervals import wilson
+from carlab.benchmark.intervals import share_text, wilson
 
 Row = Mapping[str, Any]
 EDGES = (0.0, 0.35, 0.7, 1.4, 2.8, math.inf)
@@ -64,14 +64,10 @@ def spurious_curves(rows: Iterable[Row]) -> list[Curve]:
 
 def curve_rows(curves: Iterable[Curve]) -> list[tuple[str, ...]]:
     """Return rows (group, share with interval and counts in each bin) for a table."""
-    return [(c.group, *(_cell(h, n) for h, n in zip(c.hits, c.counts, strict=True))) for c in curves]
-
-
-def _cell(hits: int, count: int) -> str:
-    if count == 0:
-        return "-"
-    low, high = wilson(hits, count)
-    return f"{hits / count:.2f} ({low:.2f} to {high:.2f}) {hits}/{count}"
+    return [
+        (c.group, *(share_text(h, n) + (f" {h}/{n}" if n else "") for h, n in zip(c.hits, c.counts, strict=True)))
+        for c in curves
+    ]
 
 
 def draw_detection(path: Path, curves: Sequence[Curve]) -> None:

@@ -23,10 +23,11 @@ import numpy as np
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
 from carlab.benchmark.proof.sealed_run import LOCAL, Progress, SealedRun, silent
-from carlab.benchmark.proof.worker import FILES, read_json, write_json
+from carlab.benchmark.proof.worker import FILES, write_json
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
+from carlab.core.json_files import read_json
 from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, ChildEnd
 
@@ -174,10 +175,8 @@ class Proof(SealedRun):
     def _work(self, what: str, order: dict[str, Any], inputs: Mapping[str, bytes], outputs: tuple[str, ...]) -> JobEnd:
         job = ChildJob((*WORKER, what), self.timeout_s, inputs, outputs, json.dumps(order), ONE_THREAD)
         done = self.executor.run(job, self.abandon)
-        end = done.end
-        if end.exit_status != 0 and not end.abandoned:
-            last = end.output.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
-            raise DataError(f"A case of the proof failed ({what}): {last[0]}")
+        if done.failure and not done.end.abandoned:
+            raise DataError(f"A case of the proof failed ({what}): {done.failure}")
         return done
 
     def _diagnose_one(self, name: str, to: Path, true_effects: tuple[str, ...]) -> ChildEnd:

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from carlab.benchmark.effects.catalogue import EFFECT_IDS
-from carlab.benchmark.intervals import wilson
+from carlab.benchmark.intervals import share_text, wilson
 from carlab.benchmark.proof.case_score import score_case
 from carlab.benchmark.proof.detection import detection_curves, spurious_curves
 
@@ -118,16 +118,7 @@ def _rate(title: str, values: Sequence[bool], target: str) -> dict[str, Any]:
 
 def _median(title: str, values: Sequence[float | None], target: str) -> dict[str, Any]:
     known = [v for v in values if v is not None]
-    if not known:
-        return {
-            "figure": title,
-            "median": None,
-            "low_quartile": None,
-            "high_quartile": None,
-            "count": 0,
-            "target": target,
-        }
-    low, middle, high = (float(q) for q in np.quantile(known, (0.25, 0.5, 0.75)))
+    low, middle, high = np.quantile(known, (0.25, 0.5, 0.75)).tolist() if known else (None, None, None)
     return {
         "figure": title, "median": middle, "low_quartile": low, "high_quartile": high, "count": len(known),
         "target": target,
@@ -138,8 +129,8 @@ def table_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """Return rows (figure, value with interval, cases, target) for a console table or Markdown."""
     rows = []
     for r in summary["rates"]:
-        value = "-" if r["share"] is None else f"{r['share']:.2f} ({r['low95']:.2f} to {r['high95']:.2f})"
-        rows.append((r["figure"], value, f"{r['hits']}/{r['count']}", r["target"]))
+        hits, count = r["hits"], r["count"]
+        rows.append((r["figure"], share_text(hits, count), f"{hits}/{count}", r["target"]))
     for r in summary["medians"]:
         value = (
             "-" if r["median"] is None else f"{r['median']:.3g} ({r['low_quartile']:.3g} to {r['high_quartile']:.3g})"

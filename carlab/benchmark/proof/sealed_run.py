@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import secrets
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, new_nonce
-from carlab.benchmark.proof.worker import read_json, write_json
+from carlab.benchmark.cases.seal import check, digest, file_digest
+from carlab.benchmark.proof.worker import write_json
 from carlab.core.errors import DataError
+from carlab.core.json_files import read_json
 from carlab.jobs.child_jobs import Executor, LocalExecutor
 from carlab.jobs.child_processes import ONE_THREAD, ChildEnd, run_parallel
 
@@ -66,7 +68,7 @@ class SealedRun:
             foreign = [p.name for p in self.root.iterdir() if p.suffix != ".toml"] if self.root.is_dir() else []
             if foreign:
                 raise DataError(f"{self.root} contains other files ({foreign[0]}); name a new folder for the proof.")
-            write_json(path, {"plan": self._plan, "names": [new_name() for _ in self._plan]})
+            write_json(path, {"plan": self._plan, "names": [secrets.token_hex(8) for _ in self._plan]})
         kept = read_json(path)
         if kept["plan"] != self._plan:
             raise DataError(
@@ -78,7 +80,7 @@ class SealedRun:
         """Hash the answers once; the hash is written to seal.json and passed to ``progress``."""
         path = self.root / "seal.json"
         if not path.exists():
-            nonce = new_nonce()
+            nonce = secrets.token_hex(32)
             answers = self._load_answers()
             write_json(self.answers_folder / "nonce.json", {"nonce": nonce})
             write_json(path, {"sha256": digest(answers, nonce), "cases": len(answers)})

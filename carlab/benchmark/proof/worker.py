@@ -49,16 +49,12 @@ def make(order: dict[str, Any]) -> None:
 
 def baselines(order: dict[str, Any]) -> None:
     """Run every baseline on the case in the working directory and write the results to ``to``."""
-    from carlab.benchmark.baselines.run import run_baselines
+    from carlab.benchmark.baselines.run import require_studies, run_baselines
     from carlab.benchmark.world.base_car import BaseCar
 
+    require_studies()
     fit, hold = (read_csv(Path(file)) for file in FILES[:2])
     write_json(Path(order["to"]), run_baselines(fit, hold, BaseCar.read(Path("car.toml")), order["floor"]))
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object."""
-    return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:

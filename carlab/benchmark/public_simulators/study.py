@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from carlab.benchmark.proof.runner import DIAGNOSE
-from carlab.benchmark.proof.worker import FILES, read_json, write_json
+from carlab.benchmark.proof.worker import FILES, write_json
 from carlab.benchmark.public_simulators.commonroad import (
     SCALE,
     AbandonedError,
@@ -23,6 +23,7 @@ from carlab.benchmark.public_simulators.commonroad_effects import physics_of, tr
 from carlab.benchmark.public_simulators.study_page import TARGET_RATIO, study_page
 from carlab.benchmark.world.measurement import as_table, write_csv
 from carlab.core.errors import DataError
+from carlab.core.json_files import read_json
 from carlab.jobs.child_jobs import ChildJob, run_job
 
 PACKAGE = "commonroad-vehicle-models"

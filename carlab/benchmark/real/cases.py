@@ -52,10 +52,6 @@ class RealCaseSpec:
     kinds: tuple[str, ...] = ()
     sizes: tuple[int, ...] = ()
 
-    def as_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Piece:
@@ -195,7 +191,7 @@ def _largest_exact(
 ) -> tuple[list[Table], dict[str, Any]] | None:
     """The tables with the largest size that clips few commands in each of them, and the answer; None without one."""
     for index in range(largest, -1, -1):
-        changes = [kind.apply(table, kind.sizes[index], draw) for table in tables]
+        changes = [kind.change(table, kind.sizes[index], draw) for table in tables]
         if not all(_are_close(change.truth, changes[0].truth) for change in changes):
             raise DataError("The recordings have different periods; use recordings of one period.")
         commands = [change.table[name] for change in changes for name in ("steering", "throttle")]

@@ -62,10 +62,6 @@ class Kind:
     change: Callable[[Table, float, float], TransformedRecording]
     identity: float = 0.0
 
-    def apply(self, table: Table, size: float, draw: float) -> TransformedRecording:
-        """Return the recording of a car with the effect."""
-        return self.change(table, size, draw)
-
     def as_dict(self, change: TransformedRecording, size: float) -> dict[str, Any]:
         """The answer, as JSON."""
         return {

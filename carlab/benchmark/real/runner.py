@@ -23,7 +23,7 @@ from carlab.benchmark.cases.proof_set import drawn
 from carlab.benchmark.cases.seal import file_digest
 from carlab.benchmark.effects.data_faults import Table
 from carlab.benchmark.proof.sealed_run import SealedRun
-from carlab.benchmark.proof.worker import read_json, write_json
+from carlab.benchmark.proof.worker import write_json
 from carlab.benchmark.real.cases import (
     MAX_PARTS,
     PIECE_S,
@@ -38,6 +38,7 @@ from carlab.benchmark.real.cases import (
 from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
 from carlab.benchmark.world.measurement import COLUMNS
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.json_files import read_json
 from carlab.jobs.child_jobs import CARLAB, ChildJob
 from carlab.jobs.child_processes import ChildEnd
 
@@ -168,8 +169,7 @@ class RealProof(SealedRun):
         done = self.executor.run(job, self.abandon)
         if not done.end.abandoned:
             if not done.outputs:
-                last = done.end.output.strip().splitlines()[-1:] or [f"exit status {done.end.exit_status}"]
-                raise DataError(f"The diagnosis of a reference failed: {last[0]}")
+                raise DataError(f"The diagnosis of a reference failed: {done.failure or 'it wrote no model.toml'}")
             done.write_outputs(folder / "out")
         return done.end
 
@@ -228,7 +228,7 @@ def _plan(
         "recordings": {name: _digest(table) for name, table in recordings.items()},
         "car": file_digest(car), "tool": tool.verb, "piece_s": PIECE_S, "max_parts": MAX_PARTS,
     }  # fmt: skip
-    return [*(spec.as_dict() for spec in specs), rules]
+    return [*(dataclasses.asdict(spec) for spec in specs), rules]
 
 
 def _digest(table: Table) -> str:

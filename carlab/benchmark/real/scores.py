@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from carlab.benchmark.intervals import wilson
+from carlab.benchmark.intervals import share_text
 from carlab.benchmark.proof.matching import Correctness, assigned
 from carlab.benchmark.proof.results_page import markdown
 from carlab.benchmark.real.kinds import KINDS
@@ -197,6 +197,10 @@ def _nameable(row: Json) -> bool:
     return _visible(row, NAMEABLE_STDS)
 
 
+def _untouched(row: Json) -> bool:
+    return row["kind"] == "null" and _reported(row)
+
+
 RATES: tuple[tuple[str, Callable[[Json], bool], Callable[[Json], Any], str], ...] = (
     ("named first, sets allowed, size at least 2 std", _visible, lambda r: r["first_with_sets"], ">= 0.90"),
     ("named first, strictly, size at least 2 std", _visible, lambda r: r["first"], ""),
@@ -205,12 +209,7 @@ RATES: tuple[tuple[str, Callable[[Json], bool], Callable[[Json], Any], str], ...
     ("named first, strictly, all sizes", _single, lambda r: r["first"], ""),
     ("cases with a spurious name", lambda r: r["kind"] != "null" and _reported(r), lambda r: bool(r["spurious"]), ""),
     ("pairs: both found", lambda r: r["kind"] == "pair", lambda r: r["found"] == 2, ""),
-    (
-        "false alarms, untouched recordings",
-        lambda r: r["kind"] == "null" and _reported(r),
-        lambda r: r["false_alarm"],
-        "<= 0.05",
-    ),
+    ("false alarms, untouched recordings", _untouched, lambda r: r["false_alarm"], "<= 0.05"),
 )
 
 
@@ -229,9 +228,7 @@ def rate_rows(rows: Rows) -> list[tuple[str, str, str, str]]:
 
 
 def _rate(title: str, hits: Sequence[bool], target: str) -> tuple[str, str, str, str]:
-    low, high = wilson(sum(hits), len(hits))
-    value = f"{sum(hits) / len(hits):.2f} ({low:.2f} to {high:.2f})" if hits else "-"
-    return title, value, f"{sum(hits)}/{len(hits)}", target
+    return title, share_text(sum(hits), len(hits)), f"{sum(hits)}/{len(hits)}", target
 
 
 def kind_rows(rows: Iterable[Json]) -> list[tuple[str, ...]]:
