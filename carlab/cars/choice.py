@@ -52,7 +52,6 @@ def choose_car(
     reality: str | Path | CarFile | None = None,
     dry_run: bool = False,
     seed: int = 0,
-    log_folder: Path | None = None,
     is_driven: bool = True,
 ) -> CarChoice:
     """Build the car of ``--car`` without opening it.
@@ -66,7 +65,6 @@ def choose_car(
             recordings keep the parameters of the other file; by default the same file.
         dry_run: discard commands.
         seed: of the sensors' noise.
-        log_folder: where an emulated car writes its log.
         is_driven: whether commands are sent to the car; a simulator that only predicts has no watchdog.
 
     Raises:
@@ -75,8 +73,6 @@ def choose_car(
     choice = _choose(name, vehicle, reality, seed)
     if is_driven:
         _check_watchdog(choice)
-    if log_folder is not None:
-        choice.log_to(log_folder)
     if dry_run:
         from drivers.dry_run_car import DryRunCar
 

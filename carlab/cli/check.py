@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes
 
 from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, table
-from carlab.cli.options import CarOptions, TaskOptions
+from carlab.cli.options import CarOptions, TaskOptions, arguments_of
 from carlab.core.errors import NotReadyError
 
 UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}
@@ -42,10 +42,7 @@ class Check:
         from carlab.api import check
 
         hooks = RunHooks(on_start=lambda folder, car: banner(car.reality, car.name, moves=False))
-        result = check(
-            **self.car.arguments(), task=self.task.task, track=self.task.track, seconds=self.seconds,
-            wheels=self.wheels, hooks=hooks,
-        )  # fmt: skip
+        result = check(**arguments_of(self, check), hooks=hooks)
         if self.task.to_text():
             console.print("No error found in the task.")
         if readings := result.health.readings:

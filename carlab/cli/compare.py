@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, progress
-from carlab.cli.options import report_folder
+from carlab.cli.options import arguments_of, report_folder
 
 
 @dataclass
@@ -48,11 +48,7 @@ class Compare:
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("comparison", total=100, note="")
             found = compare(
-                self.recordings,
-                self.changed,
-                self.car,
-                candidates=self.candidates,
-                out=self.out,
+                **arguments_of(self, compare),
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
                 stop=interrupts.requested.is_set,
             )

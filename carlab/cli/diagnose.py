@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, fail, progress
-from carlab.cli.options import report_folder
+from carlab.cli.options import arguments_of, report_folder
 from carlab.cli.recordings import print_errors
 
 if TYPE_CHECKING:
@@ -92,20 +92,7 @@ class Diagnose:
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("diagnosis", total=100, note="")
             report = diagnose(
-                self.recordings,
-                self.car,
-                held_out=self.held_out,
-                holdout_share=self.holdout_share,
-                effects=self.effects,
-                curves=self.curves,
-                ceiling=self.ceiling,
-                discrepancy=self.discrepancy,
-                adapt=self.adapt,
-                keep_events=self.keep_events,
-                budget_s=self.budget_s,
-                jobs=self.jobs,
-                seed=self.seed,
-                out=self.out,
+                **arguments_of(self, diagnose),
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
                 stop=interrupts.requested.is_set,
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,17 +12,15 @@ from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
 from carlab.api.runs import figure_names
-from carlab.cli.console import banner, console, fail, progress, table
+from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import CarOptions, TaskOptions
-from carlab.cli.runs import ask_to_place, figure_text, heading
+from carlab.cli.options import CarOptions, TaskOptions, arguments_of
+from carlab.cli.runs import common_hooks, figure_text, heading
 
 if TYPE_CHECKING:
     from carlab.api import DriveRun
     from carlab.api.runs import RunHooks
-    from carlab.core.car import Car
     from carlab.core.documents import Tick
-    from carlab.core.outcome import EndReason
 
 
 @dataclass
@@ -86,35 +83,13 @@ class Drive:
         from carlab.api import drive
 
         with progress() as bar:
-            run = drive(
-                **self.car.arguments(),
-                policy=self.policy,
-                task=self.task.task,
-                track=self.task.track,
-                episodes=self.episodes,
-                ticks=self.ticks,
-                seed=self.seed,
-                max_throttle=self.max_throttle,
-                place=self.place,
-                out=self.out,
-                name=self.name,
-                rerun=self.rerun,
-                live=self.live,
-                viewer=self.viewer,
-                picture=self.picture,
-                hooks=self._hooks(bar),
-            )
+            run = drive(**arguments_of(self, drive), hooks=self._hooks(bar))
         return self._report(run)
 
     def _hooks(self, bar: Progress) -> RunHooks:
         from carlab.api.runs import RunHooks
 
         rows: list[TaskID] = []
-        folders: list[Path] = []
-
-        def on_start(folder: Path, car: Car) -> None:
-            folders.append(folder)
-            banner(car.reality, car.name)
 
         def on_episode(number: int, ticks: int) -> None:
             rows.append(bar.add_task(f"episode {number}", total=ticks, note=""))
@@ -124,17 +99,7 @@ class Drive:
             note = f"({state.x_m:+.2f}, {state.y_m:+.2f}) m  {state.speed_mps:.2f} m/s"
             bar.update(rows[-1], completed=tick.step + 1, note=note)
 
-        def on_abandon(reason: EndReason, detail: str) -> None:
-            fail(f"{reason.value} {detail} The recording is in {folders[-1]}.")
-            os._exit(EXIT_SAFETY_STOP)
-
-        return RunHooks(
-            on_start=on_start,
-            place_by_hand=ask_to_place(bar, "use --no-place or a terminal"),
-            on_episode=on_episode,
-            on_tick=on_tick,
-            on_abandon=on_abandon,
-        )
+        return RunHooks(**common_hooks(bar), on_episode=on_episode, on_tick=on_tick)
 
     def _report(self, run: DriveRun) -> int:
         from carlab.core.outcome import EndReason

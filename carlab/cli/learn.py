@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,19 +14,16 @@ from tyro.conf import OmitArgPrefixes
 
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
 from carlab.api.runs import figure_names
-from carlab.cli.console import banner, console, fail, progress, table
+from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import CarOptions, TaskOptions
-from carlab.cli.runs import ask_to_place, figure_text, heading
+from carlab.cli.options import CarOptions, TaskOptions, arguments_of
+from carlab.cli.runs import common_hooks, figure_text, heading
 
 if TYPE_CHECKING:
     from carlab.api import LearnRun
     from carlab.api.learning import LearnHooks
-    from carlab.core.car import Car
     from carlab.core.documents import Tick
-    from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.figures import EpisodeFigures
-    from carlab.experiment.campaign.prior_correction import PriorVersion
     from carlab.experiment.campaign.quick_check import EpisodeCheck
 
 STEPS_PERIOD_S = 600.0
@@ -147,36 +143,12 @@ class Learn:
         from carlab.api import learn
 
         with progress(speed_estimate_period_s=STEPS_PERIOD_S) as bar:
-            run = learn(
-                **self.car.arguments(),
-                task=self.task.task,
-                track=self.task.track,
-                episodes=self.episodes,
-                ticks=self.ticks,
-                prior=self.prior,
-                method=self.method,
-                history=self.history,
-                model_steps=self.model_steps,
-                updates=self.updates,
-                seed=self.seed,
-                device=self.device,
-                place=self.place,
-                ray=self.ray,
-                ray_wait=self.ray_wait,
-                resume=self.resume,
-                out=self.out,
-                name=self.name,
-                rerun=self.rerun,
-                live=self.live,
-                viewer=self.viewer,
-                hooks=self._hooks(bar),
-            )
+            run = learn(**arguments_of(self, learn), hooks=self._hooks(bar))
         return self._report(run)
 
     def _hooks(self, bar: Progress) -> LearnHooks:
         from carlab.api.learning import LearnHooks
 
-        folders: list[Path] = []
         rows: dict[str, TaskID] = {}
 
         def show_progress(activity: str, done: int, total: int) -> None:
@@ -187,10 +159,6 @@ class Learn:
                 rows[activity] = bar.add_task(activity, total=total, note="")
             bar.update(rows[activity], completed=done, total=total)
 
-        def on_start(folder: Path, car: Car) -> None:
-            folders.append(folder)
-            banner(car.reality, car.name)
-
         def on_episode(number: int, ticks: int) -> None:
             show_progress(f"episode {number}", 0, ticks)
 
@@ -198,35 +166,29 @@ class Learn:
             (task,) = rows.values()
             bar.update(task, completed=tick.step + 1)
 
-        def on_abandon(reason: EndReason, detail: str) -> None:
-            fail(f"{reason.value} {detail} The recording is in {folders[-1]}.")
-            os._exit(EXIT_SAFETY_STOP)
+        def show(sentence: str) -> None:
+            bar.console.print(f"  {sentence}", soft_wrap=True)
 
         def on_learned(figures: dict[str, Any]) -> None:
             for message in _training_messages(figures):
-                bar.console.print(f"  {message}", soft_wrap=True, markup=False, highlight=False)
+                show(message)
 
         def on_check(check: EpisodeCheck) -> None:
             for sentence in check.sentences:
-                bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False)
-
-        def on_prior(version: PriorVersion) -> None:
-            bar.console.print(f"  {version.sentence}", soft_wrap=True, markup=False, highlight=False)
+                show(sentence)
 
         return LearnHooks(
-            on_start=on_start,
-            place_by_hand=ask_to_place(bar, "use --no-place or a terminal"),
+            **common_hooks(bar),
             on_episode=on_episode,
             on_tick=on_tick,
-            on_abandon=on_abandon,
             on_training=show_progress,
             on_learned=on_learned,
             on_figures=functools.partial(_print_figures, bar),
             on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
             on_correcting=functools.partial(show_progress, "correction of the prior", 0, 1),
-            on_prior=on_prior,
-            on_link=lambda sentence: bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False),
+            on_prior=lambda version: show(version.sentence),
+            on_link=show,
         )
 
     def _report(self, run: LearnRun) -> int:
@@ -284,7 +246,7 @@ class Learn:
                 "of the authors of Sim-FSVGD, within 0.05 m and 0.2 rad: "
                 f"{sum(r.is_strictly_parked for r in rows)}"
             )
-        console.print(f"{text}.", soft_wrap=True, highlight=False)
+        console.print(f"{text}.", soft_wrap=True)
 
 
 def _cost_text(row: EpisodeFigures) -> str:

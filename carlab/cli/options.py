@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import shlex
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from carlab.api.cars import car_options_text
 from carlab.core.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    from carlab.cars import CarChoice
 
 
 @dataclass
@@ -33,20 +32,9 @@ class CarOptions:
     """Car file with the true physics of a simulated or emulated car, which differ from the file of --car or --vehicle.
     Learning and diagnosis do not read it; they see the difference only in recordings."""
 
-    def arguments(self) -> dict[str, Any]:
-        """These options as keyword arguments of ``carlab.drive`` and other calls."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
     def to_text(self) -> str:
         """These options as command-line text, each with a leading space; default values are omitted."""
-        return car_options_text(**self.arguments())
-
-    def choose(self, *, seed: int, log_folder: Path | None = None, is_driven: bool = True) -> CarChoice:
-        """Build the car without opening it; ``is_driven`` as for ``choose_car``."""
-        from carlab.cars import choose_car
-
-        given = self.arguments()
-        return choose_car(given.pop("car"), **given, seed=seed, log_folder=log_folder, is_driven=is_driven)
+        return car_options_text(**vars(self))
 
 
 @dataclass
@@ -66,6 +54,15 @@ class TaskOptions:
         """These options as command-line text, each with a leading space; default values are omitted."""
         given = {"--task": self.task, "--track": self.track}
         return "".join(f" {option} {shlex.quote(str(value))}" for option, value in given.items() if value is not None)
+
+
+def arguments_of(verb: Any, call: Callable[..., Any]) -> dict[str, Any]:
+    """The options of a verb that are arguments of a call of the Python interface, by name."""
+    values = dict(vars(verb))
+    for group in ("car", "task"):
+        if is_dataclass(values.get(group)):
+            values |= vars(values.pop(group))
+    return {name: values[name] for name in inspect.signature(call).parameters if name in values}
 
 
 def new_file(path: Path, option: str, suffix: str) -> Path:

@@ -13,7 +13,7 @@ from carlab.api.arguments import above_zero, valid_seed
 from carlab.api.recordings import load
 from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, progress, table
-from carlab.cli.options import CarOptions, new_file
+from carlab.cli.options import CarOptions, arguments_of, new_file
 from carlab.cli.recordings import print_errors, print_recording
 from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
@@ -77,17 +77,22 @@ class Replay:
 
     def run(self) -> int:
         """Predict or drive, and print."""
+        from carlab.cars import choose_car
+
         above_zero(horizon=self.horizon_s, stride=self.stride_s, seconds=self.seconds)
         valid_seed(seed=self.seed)
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
-        simulated = self.car.choose(seed=self.seed, is_driven=False).car.reality is Reality.SIMULATED
-        if not simulated or self.drive:
+        car = self.car
+        choice = choose_car(
+            car.car, vehicle=car.vehicle, reality=car.reality, dry_run=car.dry_run, seed=self.seed, is_driven=False
+        )
+        if choice.car.reality is not Reality.SIMULATED or self.drive:
             for option in ("adapt", "save"):
                 if getattr(self, option):
                     raise ConfigError(f"--{option} is for predictions by a simulated car; remove it to drive.")
             return self._drive()
-        for option, value in (("seconds", self.seconds), ("reality", self.car.reality)):
+        for option, value in (("seconds", self.seconds), ("reality", car.reality)):
             if value is not None:
                 raise ConfigError(f"--{option} has no effect on predictions; add --drive, or remove it.")
         self._predict()
@@ -101,15 +106,7 @@ class Replay:
         car = self.car
         if car.vehicle is not None and car.car != "sim":
             raise ConfigError(f"--vehicle needs --car sim; '{car.car}' has its own physics.")
-        found = predict(
-            self.recording,
-            car.vehicle or car.car,
-            horizon_s=self.horizon_s,
-            stride_s=self.stride_s,
-            holdout_share=self.holdout_share,
-            adapt=self.adapt,
-            keep_events=self.keep_events,
-        )
+        found = predict(**arguments_of(self, predict) | {"car": car.vehicle or car.car})
         for note in found.recordings.notes:
             console.print(note)
         for fault in (*found.recordings.faults, *found.score.faults):
@@ -170,14 +167,7 @@ class Replay:
                 on_episode=lambda number, ticks: bar.update(row, total=ticks),
                 on_tick=lambda tick: bar.update(row, completed=tick.step + 1),
             )
-            episode, run = replay(
-                recording,
-                **self.car.arguments(),
-                seconds=self.seconds,
-                seed=self.seed,
-                out=self.out,
-                hooks=hooks,
-            )
+            episode, run = replay(**arguments_of(self, replay) | {"recording": recording}, hooks=hooks)
         if not run.episodes:
             console.print("Nothing was driven.")
             return EXIT_INTERRUPTED

@@ -1,18 +1,23 @@
-"""Prompt for a person to place the car at its start pose; figures of tasks in tables."""
+"""Callbacks of runs that several verbs share, and figures of tasks in tables."""
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from carlab.cli.console import console
+from carlab.cli.console import banner, console, fail
+from carlab.cli.exit_codes import EXIT_SAFETY_STOP
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from carlab.core.car import Car
+    from carlab.core.outcome import EndReason
     from carlab.core.quantities import CarState
 
 
@@ -37,6 +42,22 @@ def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:
         bar.start()
 
     return ask
+
+
+def common_hooks(bar: Progress) -> dict[str, Any]:
+    """Callbacks of runs with a policy: the car's banner, the prompt to place it, and the end of a hung run."""
+    folders: list[Path] = []
+
+    def on_start(folder: Path, car: Car) -> None:
+        folders.append(folder)
+        banner(car.reality, car.name)
+
+    def on_abandon(reason: EndReason, detail: str) -> None:
+        fail(f"{reason.value} {detail} The recording is in {folders[-1]}.")
+        os._exit(EXIT_SAFETY_STOP)
+
+    place_by_hand = ask_to_place(bar, "use --no-place or a terminal")
+    return {"on_start": on_start, "place_by_hand": place_by_hand, "on_abandon": on_abandon}
 
 
 def heading(name: str) -> str:
