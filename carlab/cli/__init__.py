@@ -6,7 +6,9 @@ Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 5 recordings 
 
 from __future__ import annotations
 
+import importlib
 import io
+import keyword
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -113,33 +115,13 @@ _DESCRIPTION = (
 )
 
 
-def _verbs() -> dict[str, Callable[..., Any]]:
-    from carlab.cli.bench import Bench
-    from carlab.cli.check import Check
-    from carlab.cli.compare import Compare
-    from carlab.cli.diagnose import Diagnose
-    from carlab.cli.drive import Drive
-    from carlab.cli.emulate import Emulate
-    from carlab.cli.export import Export
-    from carlab.cli.import_ import Import
-    from carlab.cli.learn import Learn
-    from carlab.cli.listen import Listen
-    from carlab.cli.prove import Prove
-    from carlab.cli.replay import Replay
-    from carlab.cli.view import View
+VERBS = (
+    *("drive", "replay", "view", "import", "export", "check", "emulate", "listen", "learn", "diagnose", "compare"),
+    *("prove", "bench"),
+)
+"""Verbs in the order of the help; each is a class, in a module of its name."""
 
-    return {
-        "drive": Drive,
-        "replay": Replay,
-        "view": View,
-        "import": Import,
-        "export": Export,
-        "check": Check,
-        "emulate": Emulate,
-        "listen": Listen,
-        "learn": Learn,
-        "diagnose": Diagnose,
-        "compare": Compare,
-        "prove": Prove,
-        "bench": Bench,
-    }
+
+def _verbs() -> dict[str, Callable[..., Any]]:
+    modules = {verb: f"carlab.cli.{verb}{'_' * keyword.iskeyword(verb)}" for verb in VERBS}
+    return {verb: getattr(importlib.import_module(module), verb.title()) for verb, module in modules.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 
 from carlab.api.arguments import above_zero, at_least, at_most
@@ -33,36 +34,19 @@ class Bench(BenchOptions):
         )  # fmt: skip
         at_least(0, first_seed=self.first_seed)
         at_most(MAX_SEED + 1 - self.seeds, first_seed=self.first_seed)
-        if self.what == "realcars":
-            from carlab.cli.bench_realcars import run_realcars
-
-            return run_realcars(self)
-        if self.what == "rollouts":
-            from carlab.cli.bench_rollouts import run_rollouts
-
-            return run_rollouts(self)
-        if self.what == "priors":
-            from carlab.cli.bench_priors import run_priors
-
-            return run_priors(self)
-        if self.what == "parking":
-            from carlab.cli.bench_parking import run_parking
-
-            return run_parking(self)
-        from carlab.cli.bench_regression import run_regression
-
-        return run_regression(self)
+        study = importlib.import_module(f"carlab.cli.bench_{self.what}")
+        return int(getattr(study, f"run_{self.what}")(self))
 
     def _speed(self) -> int:
         from carlab.studies.speed import measure_speed
 
         above_zero(seconds=self.seconds)
-        figures = measure_speed(seconds=self.seconds, device=self.device, note=lambda text: console.print(text))
+        figures = measure_speed(seconds=self.seconds, device=self.device, note=console.print)
         rows = [[part, name, f"{value:.4g}"] for part, values in figures.items() for name, value in _flat(values)]
         table("Speed", ["part", "figure", "value"], rows)
         if self.out is not None:
             write_figures(self.out, figures)
-            console.print(f"{self.out}")
+            console.print(str(self.out))
         return 0
 
 

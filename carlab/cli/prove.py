@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.cli.console import console, fail, progress, table
+from carlab.cli.exit_codes import EXIT_INTERRUPTED
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
 
@@ -103,7 +104,7 @@ class Prove:
     def run(self) -> int:
         """Create and seal the cases, diagnose them, open the seal, and score."""
         from carlab.benchmark.baselines.run import require_studies
-        from carlab.benchmark.proof.runner import Proof
+        from carlab.benchmark.proof.runner import DIAGNOSE, Proof
         from carlab.experiment.episodes.interrupts import Interrupts
 
         above_zero(jobs=self.jobs, timeout=self.timeout)
@@ -119,15 +120,15 @@ class Prove:
             return self._calibrate(Proof(self.out, specs))
         if self.baselines:
             require_studies()
-        with Interrupts() as interrupts, self._executor() as executor, _bar() as bar:
+        with Interrupts() as interrupts, self._executor() as executor, progress(speed_estimate_period_s=DAY_S) as bar:
             stages = _Bar(bar)
             proof = Proof(
-                self.out, specs, command=_diagnose_command(), progress=stages, timeout_s=self.timeout,
-                executor=executor, stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
+                self.out, specs, command=DIAGNOSE, progress=stages, timeout_s=self.timeout, executor=executor,
+                stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
             )  # fmt: skip
             if not self._stages(proof, interrupts):
                 fail(f"Stopped with {stages.last}; run the same command to continue.")
-                return 130
+                return EXIT_INTERRUPTED
         return self._score(proof)
 
     def _check_options(self) -> None:
@@ -141,25 +142,25 @@ class Prove:
                 raise ConfigError(f"--{option.name} has no effect with {use}; leave it out.")
 
     def _real(self) -> int:
-        from carlab.benchmark.real.runner import RealProof, Tool, drawn_specs
-        from carlab.cli.prove_real import car_path, require_tool, run_stages, score, tables_in
+        from carlab.benchmark.real.runner import RealProof, drawn_specs
+        from carlab.cli.prove_real import car_path, run_stages, score, tables_in
         from carlab.experiment.episodes.interrupts import Interrupts
+        from carlab.jobs.child_jobs import CARLAB
 
-        require_tool(self.tool)
         car, recordings = car_path(self.car, self.out), tables_in(self.data)
         specs, refused = drawn_specs(self.seed, self.limit, recordings)
         if refused:
             console.print(f"Not concealed, because commands would leave [-1, 1]: {', '.join(refused)}.")
-        with Interrupts() as interrupts, self._executor() as executor, _bar() as bar:
+        with Interrupts() as interrupts, self._executor() as executor, progress(speed_estimate_period_s=DAY_S) as bar:
             stages = _Bar(bar)
             proof = RealProof(
-                self.out, specs, recordings, car, tool=Tool(self.tool, _carlab_command()), command=_carlab_command(),
-                progress=stages, timeout_s=self.timeout, executor=executor, stop_requested=interrupts.requested.is_set,
+                self.out, specs, recordings, car, tool=self.tool, command=CARLAB, progress=stages,
+                timeout_s=self.timeout, executor=executor, stop_requested=interrupts.requested.is_set,
                 abandon=interrupts.urgent.is_set,
             )  # fmt: skip
             if not run_stages(proof):
                 fail(f"Stopped with {stages.last}; run the same command to continue.")
-                return 130
+                return EXIT_INTERRUPTED
         return score(proof, self.out, lambda runs: self._facts([spec.seed for spec in specs], runs))
 
     def _executor(self) -> AbstractContextManager[Executor]:
@@ -178,8 +179,7 @@ class Prove:
         with Interrupts() as interrupts:
             rows = study(
                 self.out, "multi_body" if self.simulator == "commonroad" else "drift", seeds,
-                command=_diagnose_command(), timeout_s=self.timeout, progress=console.print,
-                abandon=interrupts.requested.is_set,
+                timeout_s=self.timeout, progress=console.print, abandon=interrupts.requested.is_set,
             )  # fmt: skip
         met = sum(1 for row in rows if row.get("ratio") is not None and row["ratio"] <= TARGET_RATIO)
         console.print(
@@ -188,7 +188,7 @@ class Prove:
         )
         if len(rows) < len(seeds):
             fail(f"Stopped after {len(rows)} of {len(seeds)} drives.")
-            return 130
+            return EXIT_INTERRUPTED
         return 0 if all(row["verdict"] for row in rows) else 1
 
     def _calibrate(self, proof: Proof) -> int:
@@ -277,10 +277,6 @@ class Prove:
         }
 
 
-def _bar() -> AbstractContextManager[Progress]:
-    return progress(speed_estimate_period_s=DAY_S)
-
-
 class _Bar:
     """Shows the stages on the console: a bar on a terminal, a line now and then in a file; the seal always."""
 
@@ -309,15 +305,3 @@ class _Bar:
         if done in (before, total):
             return ""
         return f", about {(now_s - since_s) / (done - before) * (total - done) / 60.0:.0f} min left"
-
-
-def _diagnose_command() -> tuple[str, ...]:
-    from carlab.benchmark.proof.runner import DIAGNOSE
-
-    return DIAGNOSE
-
-
-def _carlab_command() -> tuple[str, ...]:
-    from carlab.jobs.child_jobs import CARLAB
-
-    return CARLAB

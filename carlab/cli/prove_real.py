@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,12 +17,6 @@ from carlab.core.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from carlab.benchmark.real.runner import RealProof
     from carlab.core.quantities import FloatArray
-
-
-def require_tool(verb: str) -> None:
-    """Raise ConfigError if this version of carlab does not have the verb."""
-    if importlib.util.find_spec(f"carlab.cli.{verb}") is None:
-        raise ConfigError(f"--tool {verb}: this version of carlab has no 'carlab {verb}'; use --tool diagnose.")
 
 
 def car_path(car: str, folder: Path) -> Path:

@@ -14,7 +14,7 @@ import torch
 
 from carlab.benchmark.real.cases import RealCaseSpec, case_specs, make_real_case, parts, reference, with_full_lock
 from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, Kind, Truth
-from carlab.benchmark.real.runner import RealProof, Tool
+from carlab.benchmark.real.runner import RealProof
 from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, real_results_page, score_comparison
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
@@ -172,7 +172,7 @@ def test_tool_sees_files_without_the_answer(recordings: dict[str, dict[str, np.n
     specs = [RealCaseSpec("single", 1, ("steering_offset",), (2,)), RealCaseSpec("null", 2)]
     log: list[str] = []
     proof = RealProof(
-        tmp_path / "proof", specs, recordings, car, tool=Tool("compare", FAKE), command=FAKE,
+        tmp_path / "proof", specs, recordings, car, tool="compare", command=FAKE,
         progress=lambda stage, done, total, note: log.append(stage),
     )  # fmt: skip
     with pytest.raises(DataError, match="Seal the answers"):
@@ -210,7 +210,7 @@ def test_tool_sees_files_without_the_answer(recordings: dict[str, dict[str, np.n
     other_car.write_text(car.read_text().replace("0.42", "0.5"))
     for others in ((recordings, other_car), (drifted, car)):
         with pytest.raises(DataError, match="proof of other cases or files"):
-            RealProof(proof.root, specs, *others, tool=Tool("compare", FAKE), command=FAKE).make()
+            RealProof(proof.root, specs, *others, tool="compare", command=FAKE).make()
     handed = proof.root / "handed" / next(iter(rows)) / "other_1.csv"
     handed.write_text(handed.read_text().replace("0", "1", 1))
     with pytest.raises(DataError, match="seal is broken"):

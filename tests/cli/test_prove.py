@@ -15,8 +15,8 @@ import pytest
 
 from carlab.benchmark.cases import proof_set
 from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.proof import runner
 from carlab.benchmark.proof.runner import Proof
-from carlab.cli import prove
 from carlab.jobs.child_jobs import LocalExecutor
 
 Carlab = Callable[..., tuple[int, str]]
@@ -46,9 +46,7 @@ def proof_dir(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Folder of a proof with two small cases and a fake diagnosis."""
     root = tmp_path / "proof"
     monkeypatch.setattr(proof_set, "short_set", lambda purpose, seed=0: SPECS)
-    monkeypatch.setattr(
-        prove, "_diagnose_command", lambda: (sys.executable, "-c", LOGGING_DIAGNOSIS, str(root), str(FAKE_DIAGNOSIS))
-    )
+    monkeypatch.setattr(runner, "DIAGNOSE", (sys.executable, "-c", LOGGING_DIAGNOSIS, str(root), str(FAKE_DIAGNOSIS)))
     return root
 
 
@@ -148,9 +146,10 @@ def test_options_without_effect_are_refused(tmp_path: Path, carlab: Carlab) -> N
 PROOF_WITH_WAITING_DIAGNOSIS = """
 import sys
 from pathlib import Path
-from carlab.cli import prove, run
+from carlab.cli import run
 from carlab.benchmark.cases import proof_set
 from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.proof import runner
 root, fake_diagnosis = sys.argv[1:]
 waiting = '''
 import pathlib, runpy, sys, time
@@ -163,7 +162,7 @@ runpy.run_path(fake_diagnosis, run_name="__main__")
 '''
 specs = [CaseSpec("null", k, fit_s=8.0, hold_s=5.0) for k in (2, 3)]
 proof_set.short_set = lambda purpose, seed=0: specs
-prove._diagnose_command = lambda: (sys.executable, "-c", waiting, root, fake_diagnosis)
+runner.DIAGNOSE = (sys.executable, "-c", waiting, root, fake_diagnosis)
 sys.exit(run(["prove", "--out", root, "--no-baselines", "--no-oracle"]))
 """
 

@@ -8,8 +8,8 @@ import pytest
 from recorded_drives import drive
 
 from carlab.api.cars import load_car
-from carlab.cli import prove
 from carlab.cli.prove_real import car_path
+from carlab.jobs import child_jobs
 from carlab.recording import write_csv
 from sim_backends import SimulatorConfig
 
@@ -28,7 +28,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recordings_of_a_folder_are_sealed_answered_and_scored(
     data: Path, tmp_path: Path, carlab: Carlab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(prove, "_carlab_command", lambda: (sys.executable, str(FAKE)))
+    monkeypatch.setattr(child_jobs, "CARLAB", (sys.executable, str(FAKE)))
     options = ("prove", "--set", "real", "--data", data, "--car", "rc_car", "--out", tmp_path / "proof", "--limit", 3)
     code, text = carlab(*options)
     assert code == 0, text

@@ -13,7 +13,6 @@ import dataclasses
 import hashlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -45,30 +44,8 @@ from carlab.jobs.child_processes import ChildEnd
 OTHER, CAR, MODEL = "other_{}.csv", "car.toml", "model.toml"
 ONE_PROCESS = ("--jobs", "1")
 REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves", *ONE_PROCESS)
+Tool = Literal["compare", "diagnose"]
 CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.names if "." not in name}))
-
-
-@dataclass(frozen=True)
-class Tool:
-    """A command that answers, and the file of its report.
-
-    ``compare`` gets the untouched recordings, ``--with other_1.csv ...``, the reference's model and a folder.
-    ``diagnose`` gets the other recordings alone, and searches only the effects of commands and sensors.
-    """
-
-    verb: Literal["compare", "diagnose"]
-    command: tuple[str, ...] = CARLAB
-
-    @property
-    def report(self) -> str:
-        """Name of the report in the tool's folder."""
-        return "compare.json" if self.verb == "compare" else "report.json"
-
-    def arguments(self, untouched: Sequence[str], others: Sequence[str]) -> list[str]:
-        """The command line of one case."""
-        recordings = [*untouched, "--with", *others] if self.verb == "compare" else [*others]
-        options = [] if self.verb == "compare" else ["--effects", *CONCEALABLE_EFFECTS, *ONE_PROCESS]
-        return [*self.command, self.verb, *recordings, "--car", MODEL, "--out", "out", *options]
 
 
 class RealProof(SealedRun):
@@ -79,8 +56,10 @@ class RealProof(SealedRun):
         specs: The cases.
         recordings: Recordings by name, with the columns of ``measurement.COLUMNS``.
         car: TOML file of the car.
-        tool: What answers.
-        command: The program that diagnoses the references.
+        tool: The command that answers. ``compare`` gets the untouched recordings, those of the case and the model of
+            the reference; ``diagnose`` does not get the untouched ones, and searches the effects of commands and
+            sensors only.
+        command: The program, without the name of a command.
         options: As for ``SealedRun``.
     """
 
@@ -101,6 +80,7 @@ class RealProof(SealedRun):
         self.car = car
         self.tool = tool
         self.command = tuple(command)
+        self.report_file = "compare.json" if tool == "compare" else "report.json"
         self.parts = parts(self.recordings)
 
     def case_names(self) -> list[str]:
@@ -146,7 +126,7 @@ class RealProof(SealedRun):
 
     def reports(self) -> dict[str, dict[str, Any]]:
         """The tool's report and ``run.json`` by name of the case."""
-        return self.results("answered", self.tool.report)
+        return self.results("answered", self.report_file)
 
     def models(self) -> dict[str, dict[str, Any]]:
         """The model of the reference of each case, parsed."""
@@ -176,12 +156,14 @@ class RealProof(SealedRun):
     def _answer_one(self, name: str) -> ChildEnd:
         untouched = sorted(self._model(name).parents[1].glob("untouched_*.csv"))
         others = sorted((self.root / "handed" / name).glob(OTHER.format("*")))
-        sources = (*untouched, self._model(name), *others)
-        job = ChildJob(
-            tuple(self.tool.arguments([p.name for p in untouched], [p.name for p in others])), self.timeout_s,
-            {path.name: path.read_bytes() for path in sources}, (f"out/{self.tool.report}",),
-            environment=self.environment,
-        )  # fmt: skip
+        changed = [path.name for path in others]
+        if self.tool == "compare":
+            arguments = [*(path.name for path in untouched), "--with", *changed]
+        else:
+            arguments = [*changed, "--effects", *CONCEALABLE_EFFECTS, *ONE_PROCESS]
+        command = (*self.command, self.tool, *arguments, "--car", MODEL, "--out", "out")
+        inputs = {path.name: path.read_bytes() for path in (*untouched, self._model(name), *others)}
+        job = ChildJob(command, self.timeout_s, inputs, (f"out/{self.report_file}",), environment=self.environment)
         done = self.executor.run(job, self.abandon)
         if not done.end.abandoned:
             to = self.root / "answered" / name
@@ -226,7 +208,7 @@ def _plan(
 ) -> list[dict[str, Any]]:
     rules = {
         "recordings": {name: _digest(table) for name, table in recordings.items()},
-        "car": file_digest(car), "tool": tool.verb, "piece_s": PIECE_S, "max_parts": MAX_PARTS,
+        "car": file_digest(car), "tool": tool, "piece_s": PIECE_S, "max_parts": MAX_PARTS,
     }  # fmt: skip
     return [*(dataclasses.asdict(spec) for spec in specs), rules]
 
