@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from carlab.core.errors import ConfigError
@@ -40,15 +40,6 @@ class AdaptationNoise:
         for value in (*self.error_std, self.white_share, *self.loss_std, *self.feature_std):
             if not 0.0 < value < math.inf:
                 raise ConfigError(f"A number in [recording_noise.adaptation] is {value:g}; it must be > 0.")
-
-    def to_table(self) -> dict[str, Any]:
-        """The content of the table."""
-        return {
-            "error_std": list(self.error_std),
-            "white_share": self.white_share,
-            "loss_std": list(self.loss_std),
-            "feature_std": list(self.feature_std),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +86,5 @@ class RecordingNoise:
         return self.floor_std if math.isclose(self.floor_horizon_s, horizon_s, rel_tol=1e-3) else None
 
     def to_table(self) -> dict[str, Any]:
-        """The content of the table."""
-        floor = {} if self.floor_std is None else {"floor_std": list(self.floor_std)}
-        adaptation = {} if self.adaptation is None else {"adaptation": self.adaptation.to_table()}
-        return {
-            "measured_std": list(self.measured_std),
-            "initial_state_std": list(self.initial_state_std),
-            "velocity_window_s2": self.velocity_window_s2,
-            **floor,
-            "floor_horizon_s": self.floor_horizon_s,
-            **adaptation,
-        }
+        """The content of the table, without unknown entries."""
+        return {name: value for name, value in asdict(self).items() if value is not None}

@@ -104,7 +104,7 @@ def test_recording_noise_is_read_and_checked(tmp_path: Path) -> None:
     assert read is not None
     assert read.adaptation is not None
     assert (read.adaptation.error_std[0], read.adaptation.white_share) == (1.0, 0.1)
-    assert read.to_table()["adaptation"]["loss_std"] == [6.0, 5.0, 4.0, 3.0, 2.0, 1.0]
+    assert read.to_table()["adaptation"]["loss_std"] == (6.0, 5.0, 4.0, 3.0, 2.0, 1.0)
     path.write_text(f"{text}\n{table}".replace("0.1\nloss", "0\nloss"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"\[recording_noise.adaptation\] is 0; it must be > 0"):
         load_car_file(path)
