@@ -73,7 +73,7 @@ def run_jobs(
         All results in the order of the study, and whether ^C ended it.
     """
     from carlab.experiment.episodes.interrupts import Interrupts
-    from carlab.jobs.choice import chosen_executor
+    from carlab.jobs.ray_executor import chosen_executor
 
     found: dict[int, list[Result]] = {}
     executor_of_options = chosen_executor(options.ray, options.jobs, gpu=options.device == "cuda")
@@ -141,6 +141,3 @@ def read_figures(end: JobEnd) -> dict[str, object]:
     """The figures of a job. Raises KeyError or ValueError if it left none."""
     content: dict[str, object] = json.loads(end.outputs[FIGURES])
     return content
-
-
-__all__ = ["DATA", "StudyJob", "bench_job", "read_figures", "recorded_files", "run_jobs", "uses_jobs"]

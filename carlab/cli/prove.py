@@ -164,7 +164,7 @@ class Prove:
         return score(proof, self.out, lambda runs: self._facts([spec.seed for spec in specs], runs))
 
     def _executor(self) -> AbstractContextManager[Executor]:
-        from carlab.jobs.choice import chosen_executor
+        from carlab.jobs.ray_executor import chosen_executor
 
         return chosen_executor(self.ray, self.jobs)
 

@@ -69,11 +69,9 @@ class Executor(Protocol):
     @property
     def jobs(self) -> int:
         """Number of parallel jobs."""
-        ...
 
     def run(self, job: ChildJob, abandon: Callable[[], bool]) -> JobEnd:
         """Run a job to its end; ``abandon`` is polled, and true kills it."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,16 +115,3 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
-
-
-__all__ = [
-    "CARLAB",
-    "PYTHON",
-    "ChildJob",
-    "Executor",
-    "JobEnd",
-    "LocalExecutor",
-    "read_files",
-    "run_job",
-    "write_files",
-]

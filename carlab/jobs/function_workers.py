@@ -18,7 +18,7 @@ from carlab.jobs.child_processes import ONE_THREAD
 
 log = logging.getLogger(__name__)
 
-WORKER = ("-m", "carlab.jobs.function_worker")
+WORKER = ("-m", "carlab.jobs.function_workers")
 Result = TypeVar("Result")
 
 
@@ -188,4 +188,9 @@ def serve(connection: Connection) -> None:
         connection.send(function(*arguments))
 
 
-__all__ = ["FunctionWorkers", "cores_count", "serve"]
+if __name__ == "__main__":  # the program of a child process
+    with Connection(int(sys.argv[1])) as parent:
+        try:
+            serve(parent)
+        except Exception:  # the parent makes the call again, and reports its error
+            sys.exit(1)

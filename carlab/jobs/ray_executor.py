@@ -11,6 +11,7 @@ import os
 import platform
 import socket
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import Any
 
@@ -18,7 +19,7 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.extras import install_hint
 from carlab.core.version import VERSION
-from carlab.jobs.child_jobs import ChildJob, JobEnd, run_job
+from carlab.jobs.child_jobs import ChildJob, Executor, JobEnd, LocalExecutor, run_job
 from carlab.jobs.child_processes import ChildEnd
 
 LOCAL = "local"
@@ -90,6 +91,24 @@ class RayExecutor:
         return end
 
 
+def chosen_executor(ray: str, jobs: int, *, gpu: bool = False) -> AbstractContextManager[Executor]:
+    """The executor of ``--ray`` and ``--jobs``, as a context manager.
+
+    Args:
+        ray: ``local`` or the address of a cluster; empty: child processes of this machine.
+        jobs: number of parallel child processes without Ray.
+        gpu: each job needs a GPU.
+
+    Raises:
+        ConfigError: both are given, or Ray is not installed.
+    """
+    if not ray:
+        return nullcontext(LocalExecutor(jobs))
+    if jobs > 1:
+        raise ConfigError("--ray replaces --jobs; leave one of them out.")
+    return RayExecutor(ray, gpu=gpu)
+
+
 def require_ray() -> None:
     """Raise ConfigError if Ray is not installed."""
     if importlib.util.find_spec("ray") is None:
@@ -139,6 +158,3 @@ def require_same_version(version: str) -> None:
             f"The machine {platform.node()} of the cluster has carlab {VERSION}, this one {version}; install the same "
             "version on both."
         )
-
-
-__all__ = ["LOCAL", "RayExecutor", "connect", "first_line", "require_ray", "require_same_version"]
