@@ -228,6 +228,3 @@ def _command(given: BenchOptions) -> str:
     if REGRESSION.applies_to(given):
         return f"{command} --case {given.case}"
     return f"{command} --data {given.data}" if READ.applies_to(given) else command
-
-
-__all__ = ["EVERYWHERE", "STUDIES_OF_OPTION", "BenchOptions", "check_options", "row_counts"]

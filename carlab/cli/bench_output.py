@@ -145,6 +145,3 @@ def _figures(row: Row) -> list[str]:
         f"{row.calibration:.3f}",
         f"{row.seconds:.1f}",
     ]
-
-
-__all__ = ["command", "print_rows", "report", "run_and_write", "write_figures"]

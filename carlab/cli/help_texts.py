@@ -77,6 +77,3 @@ def _placeholder(hint: Any) -> str:
 
 def _default_text(default: str) -> str:
     return "" if default in EMPTY_DEFAULTS else f"(default: {default})"
-
-
-__all__ = ["improve_help"]

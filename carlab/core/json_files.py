@@ -58,6 +58,3 @@ def plain(value: Any, names: Mapping[str, str] | None = None) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(v, names) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-__all__ = ["plain", "read_json"]

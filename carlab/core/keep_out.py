@@ -47,5 +47,3 @@ class Polygon:
 
 
 KeepOut = Disc | Polygon
-
-__all__ = ["Corners", "Disc", "KeepOut", "Polygon"]

@@ -25,6 +25,3 @@ def with_current_methods(arguments: Sequence[str]) -> list[str]:
         is_method = option in METHOD_OPTIONS
         current.append(f"{option}{equals}{current_method(value)}" if is_method else argument)
     return current
-
-
-__all__ = ["FORMER_METHODS", "METHOD_OPTIONS", "current_method", "with_current_methods"]

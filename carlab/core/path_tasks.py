@@ -178,6 +178,3 @@ class LapTask(_ClosedPathTask):
     def outlines_m(self) -> tuple[Corners, ...]:
         """The borders of the track."""
         return self.track.borders_m
-
-
-__all__ = ["LapTask", "PathTask", "figure_eight_path", "lap_times"]

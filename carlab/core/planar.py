@@ -32,6 +32,3 @@ def arc(vx: Any, vy: Any, yaw_rate: Any, time_s: Any) -> tuple[Any, Any, Any]:
     xp = array_namespace(turn)
     along, across = xp.sinc(turn / math.pi), xp.sin(0.5 * turn) * xp.sinc(0.5 * turn / math.pi)
     return time_s * (along * vx - across * vy), time_s * (across * vx + along * vy), turn
-
-
-__all__ = ["arc", "to_body", "to_world"]

@@ -2,5 +2,3 @@
 
 MAX_SEED = 2**32 - 1
 """Largest seed of all commands: ``numpy.random.seed``, which stable-baselines3 calls, takes 32 bits."""
-
-__all__ = ["MAX_SEED"]

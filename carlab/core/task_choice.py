@@ -170,5 +170,3 @@ def _task_of_file(file: str, class_name: str, sha256: str) -> Task:
 
 
 PARKING = TaskChoice()
-
-__all__ = ["PARKING", "TASKS", "TaskChoice", "choose_task"]

@@ -47,6 +47,3 @@ def toml_tables(text: str) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from error
     except ValueError as error:
         raise ValueError("it has too long an integer") from error
-
-
-__all__ = ["read_toml", "toml_tables"]

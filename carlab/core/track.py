@@ -219,6 +219,3 @@ def _checked(rows: list[list[float]], where: str) -> Track:
             f"{steps[:-1].max():.3g} m apart; add the points between, because a track is closed."
         )
     return Track(tuple((float(x), float(y)) for x, y in values[:, :2]), tuple(float(w) for w in values[:, 2]))
-
-
-__all__ = ["ClosedPath", "Projection", "Track", "oval_track", "read_track", "track_from_table", "wrap_length"]

@@ -134,6 +134,3 @@ def passes(decision: Mapping[str, Any], setting: str, value: float) -> bool:
 
 def _rate(count: int, of: int) -> str:
     return f"{count / of:.3f} ({count} of {of})" if of else "none"
-
-
-__all__ = ["COLUMNS", "Rates", "calibrate", "passes"]
