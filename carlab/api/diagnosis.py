@@ -18,6 +18,7 @@ from carlab.api.loaded_recordings import (
     check_contents,
     load_recordings,
 )
+from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -266,8 +267,6 @@ def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: Recordi
 
 
 def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike]) -> None:
-    from carlab.core.errors import ConfigError
-
     if holdout_share is not None and held_out:
         raise ConfigError(
             "--holdout-share has no effect together with held-out recordings (of a run folder, every third episode is "
@@ -277,7 +276,6 @@ def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike])
 
 def _checked_effects(effects: Sequence[str]) -> tuple[str, ...]:
     """Names of effects as a tuple; a single string is one name. Raises ConfigError for an unknown one."""
-    from carlab.core.errors import ConfigError
     from carlab.core.tables import nearest_name
     from sim_backends.effects import CATALOGUE
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.recordings import Recording, is_csv, required_file
+from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
@@ -46,8 +47,6 @@ def assigned(
     recordings: list[RecordingLike], held_out: list[RecordingLike]
 ) -> tuple[list[RecordingLike], list[RecordingLike]]:
     """Recordings to fit and to hold out, with run folders resolved. Raises ConfigError if one is both."""
-    from carlab.core.errors import ConfigError
-
     if not recordings:
         raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
     to_fit: list[RecordingLike] = []
@@ -66,8 +65,6 @@ def recordings_of_runs(
     first: list[RecordingLike], second: list[RecordingLike]
 ) -> tuple[list[RecordingLike], list[RecordingLike]]:
     """Two groups with run folders replaced by their episodes. Raises ConfigError if a recording is in both."""
-    from carlab.core.errors import ConfigError
-
     groups: list[list[RecordingLike]] = []
     for items in (first, second):
         resolved = [_episodes_of_run(item) if isinstance(item, Path) else ([item], []) for item in items]
@@ -81,8 +78,6 @@ def recordings_of_runs(
 
 def _check_repetition(items: Iterable[RecordingLike]) -> None:
     """Raise ConfigError if a file is given twice, for example by itself and by its run folder."""
-    from carlab.core.errors import ConfigError
-
     known: set[Path] = set()
     for path in (_path_of(item) for item in items):
         if path is not None and path.resolve() in known:
@@ -92,8 +87,6 @@ def _check_repetition(items: Iterable[RecordingLike]) -> None:
 
 def check_contents(uses: Iterable[RecordingUse]) -> None:
     """Raise ConfigError if two recordings have the same content: a copy of a fitted recording is not held out."""
-    from carlab.core.errors import ConfigError
-
     known: dict[str, str] = {}
     for use in uses:
         if use.sha256 in known:
@@ -109,7 +102,6 @@ def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
     """Episodes of a run folder to fit and to hold out (every third); for other paths the path itself, to fit."""
     if not (path / "episodes").is_dir():
         return [path], []
-    from carlab.core.errors import ConfigError
     from carlab.recording.mcap.source import has_ticks
 
     driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from carlab.api.runs import html_table
+from carlab.core.errors import ConfigError, DataError
+
 if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
     from carlab.recording.audit.report import AuditReport
@@ -61,8 +64,6 @@ class Recording:
             ConfigError: the ending is not one of these.
             DataError: the file exists or cannot be written, or several episodes do not fit into its format.
         """
-        from carlab.core.errors import ConfigError, DataError
-
         path = Path(path)
         name = path.name.lower()
         if not name.endswith((*CSV_ENDINGS, ".mcap", ".parquet", ".rrd", ".png")):
@@ -94,12 +95,8 @@ class Recording:
 
     def _repr_html_(self) -> str:
         rows = [] if self.audit is None else self.audit.rows()
-        found = "".join(
-            f"<tr><td>{row[0]}</td><td>{html.escape(row[1])}</td><td>{html.escape(row[2])}</td>"
-            f"<td style='text-align:left'>{html.escape(row[4])}</td></tr>"
-            for row in rows
-        )
-        table = f"<table><tr><th>severity<th>finding<th>channel<th>sentence</tr>{found}</table>" if found else ""
+        cells = [[severity, identity, channel, sentence] for severity, identity, channel, _, sentence, _ in rows]
+        table = html_table(["severity", "finding", "channel", "sentence"], cells) if cells else ""
         return f"<p>{html.escape(repr(self).strip('<>'))}</p><p>{html.escape(self.announcement)}</p>{table}"
 
 
@@ -124,8 +121,6 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
         ConfigError: the file does not exist, or an option or mapping is invalid.
         DataError: the file cannot be read as declared.
     """
-    from carlab.core.errors import ConfigError
-
     path = required_file(Path(path))
     if is_csv(path):
         from carlab.recording.csv.foreign import import_csv
@@ -145,8 +140,6 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
 
 def required_file(path: Path, what: str = "The recording") -> Path:
     """Return the path of an existing file. Raises ConfigError if it is not a file."""
-    from carlab.core.errors import ConfigError
-
     if not path.exists():
         from carlab.recording.sink import partial_path
 
@@ -181,7 +174,6 @@ def save_run(run: Path | str, path: Path | str) -> Path:
         ConfigError: the folder is not a run's, or the ending is not one of these.
         DataError: no recording can be read, or the file cannot be written.
     """
-    from carlab.core.errors import ConfigError
     from carlab.experiment.campaign.report import PICTURE_FILE, learning_curve
     from carlab.experiment.campaign.run_recording import readable_episodes, write_run_recording
     from carlab.recording import RunDirectory, save_summary
@@ -220,7 +212,6 @@ def resolved_mapping(
     Raises:
         ConfigError: the mapping file or an option is invalid.
     """
-    from carlab.core.errors import ConfigError
     from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
     from carlab.recording.csv.table import read_csv
 
