@@ -85,20 +85,16 @@ def pysindy_regression(system: System) -> FloatArray:
         # Without coefficients above the threshold the package warns and returns an empty model, which is valid here.
         if np.abs(np.linalg.solve(x.T @ x + 1e-3 * np.eye(x.shape[1]), x.T @ y)).max() < threshold:
             break
-        found.append(_quietly(solver, x, y) / lengths * unit)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "sparsity parameter is too big": the coefficients are then zero
+            solver.fit(x, y)
+        found.append(np.asarray(solver.coef_, dtype=np.float64).reshape(-1) / lengths * unit)
     found.append(np.zeros(len(lengths)))
     squares = [system.squares(c) for c in found]
     best = min(range(len(found)), key=lambda k: float(squares[k].mean()))
     worse = [s - squares[best] for s in squares]
     near = [k for k, w in enumerate(worse) if w.mean() <= w.std() / np.sqrt(len(w))]
     return np.asarray(found[max(near)])
-
-
-def _quietly(solver: object, x: FloatArray, y: FloatArray) -> FloatArray:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # "sparsity parameter is too big": the coefficients are then zero
-        solver.fit(x, y)  # type: ignore[attr-defined]
-    return np.asarray(solver.coef_, dtype=np.float64).reshape(-1)  # type: ignore[attr-defined]
 
 
 def stepwise_bic(system: System) -> FloatArray:

@@ -14,7 +14,7 @@ Folder of a proof:
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,13 @@ import numpy as np
 
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
-from carlab.benchmark.proof.sealed_run import LOCAL, Progress, SealedRun, silent
+from carlab.benchmark.proof.sealed_run import SealedRun
 from carlab.benchmark.proof.worker import FILES, write_json
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
 from carlab.core.json_files import read_json
-from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, JobEnd
+from carlab.jobs.child_jobs import PYTHON, ChildJob, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, ChildEnd
 
 DIAGNOSE = (PYTHON, "-m", "carlab", "diagnose", "--decisions", "--jobs", "1")
@@ -46,30 +46,13 @@ class Proof(SealedRun):
         specs: The cases; they must equal those of an existing folder.
         command: Command of a diagnosis; ``fit.csv --car car.toml --holdout hold.csv --out out`` is appended, and
             ``--effects ID ...`` if the true names are given.
-        progress: Called with stage (``make``, ``seal``, ``diagnose``, ``oracle``, ``baselines``), done, total and a
-            note.
-        timeout_s: Time-out of a diagnosis, which then counts as failed.
-        stop_requested: Called before each case; True ends the stage after the running cases.
-        abandon: Polled; True kills the running cases, which are repeated when the stage is resumed.
-        executor: Runs the child processes; with more than one job in parallel, each uses one thread.
+        options: As for ``SealedRun``; the stages are ``make``, ``seal``, ``diagnose``, ``oracle`` and ``baselines``.
     """
 
     def __init__(
-        self,
-        root: Path,
-        specs: Sequence[CaseSpec],
-        *,
-        command: Sequence[str] = DIAGNOSE,
-        progress: Progress = silent,
-        timeout_s: float = 1800.0,
-        stop_requested: Callable[[], bool] = lambda: False,
-        abandon: Callable[[], bool] = lambda: False,
-        executor: Executor = LOCAL,
+        self, root: Path, specs: Sequence[CaseSpec], *, command: Sequence[str] = DIAGNOSE, **options: Any
     ) -> None:
-        super().__init__(
-            root, [spec.as_dict() for spec in specs], progress=progress, timeout_s=timeout_s,
-            stop_requested=stop_requested, abandon=abandon, executor=executor,
-        )  # fmt: skip
+        super().__init__(root, [spec.as_dict() for spec in specs], **options)
         self.specs = list(specs)
         self.command = tuple(command)
 

@@ -19,10 +19,6 @@ Progress = Callable[[str, int, int, str], None]
 LOCAL = LocalExecutor()
 
 
-def silent(stage: str, done: int, total: int, note: str) -> None:
-    """Report nothing."""
-
-
 class SealedRun:
     """Folder with ``seal.json``, ``handed/NAME/`` (input of the tool) and ``answers/`` (not accessible to the tool).
 
@@ -41,7 +37,7 @@ class SealedRun:
         root: Path,
         plan: Sequence[Mapping[str, Any]],
         *,
-        progress: Progress = silent,
+        progress: Progress = lambda stage, done, total, note: None,
         timeout_s: float = 1800.0,
         stop_requested: Callable[[], bool] = lambda: False,
         abandon: Callable[[], bool] = lambda: False,

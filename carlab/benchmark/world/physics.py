@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from carlab.benchmark.world.base_car import BaseCar
@@ -20,6 +21,7 @@ BLEND_FROM_MPS = 0.3
 BLEND_OVER_MPS = 0.2
 
 
+@dataclass(init=False, eq=False, repr=False, slots=True)
 class Instant:
     """All variables at one time; hooks read and change them stage by stage.
 
@@ -28,12 +30,6 @@ class Instant:
     the body frame and moment [N m]). Angles are in rad, velocities in m/s and rad/s, forces and loads in N. Hidden
     states of hooks are ``extra``, their rates go to ``rates``.
     """
-
-    __slots__ = (
-        "alpha_f", "alpha_r", "cos_d", "d", "drive", "extra", "ff", "fr", "fx", "fz_f", "fz_r", "moment",
-        "mu_f", "mu_r", "psi", "push_x", "push_y", "r", "rates", "shape_f", "shape_r", "sin_d", "t", "u", "vx", "vy",
-        "x", "y",
-    )  # fmt: skip
 
     t: float
     x: float
