@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, inverse, plain
+from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, inverse, plain
 from carlab.benchmark.world.physics import Instant, World
 
 
@@ -29,26 +29,20 @@ def packet_queue(world: World, p: Parameters) -> None:
     world.arrival[0] = world.arrival[1] = arrive
 
 
-def polled(world: World, channel: int, mean_s: float) -> None:
+def polled(channel: int) -> Attach:
     """A receiver that polls every 2 / 3 of the mean delay and forwards a command one poll later."""
-    look = max(2.0 * mean_s / 3.0, 1e-6)
-    before = world.arrival[channel]
 
-    def arrive(t: float) -> float:
-        acts = before(t)
-        return (math.floor(acts / look) + 2.0) * look if mean_s > 0.0 else acts
+    def attach(world: World, p: Parameters) -> None:
+        period_s = max(2.0 * p["delay"] / 3.0, 1e-6)
+        before = world.arrival[channel]
 
-    world.arrival[channel] = arrive
+        def arrive(t: float) -> float:
+            acts = before(t)
+            return (math.floor(acts / period_s) + 2.0) * period_s if p["delay"] > 0.0 else acts
 
+        world.arrival[channel] = arrive
 
-def polled_steering(world: World, p: Parameters) -> None:
-    """Steering by polling."""
-    polled(world, 0, p["delay"])
-
-
-def polled_throttle(world: World, p: Parameters) -> None:
-    """Throttle by polling."""
-    polled(world, 1, p["delay"])
+    return attach
 
 
 def limited_servo(world: World, p: Parameters) -> None:
@@ -151,8 +145,8 @@ def servo_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 FORMS = (
     Form("command_delay", "other", seeded("extra_delay"), packet_queue, 0.01, 0.15),
-    Form("steering_delay", "other", plain("delay"), polled_steering, 0.01, 0.2),
-    Form("throttle_delay", "other", plain("delay"), polled_throttle, 0.03, 0.4),
+    Form("steering_delay", "other", plain("delay"), polled(0), 0.01, 0.2),
+    Form("throttle_delay", "other", plain("delay"), polled(1), 0.03, 0.4),
     Form("steering_lag", "other", servo_parameters, limited_servo, 0.01, 0.4),
     Form("steering_rate_limit", "other", inverse("rate"), soft_rate_limit, 0.1, 1.5),
     Form("steering_backlash", "other", plain("play"), sprung_play, 0.01, 0.4),

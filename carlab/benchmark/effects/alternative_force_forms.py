@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, heading, hook, plain, signed
 from carlab.benchmark.effects.force_forms import STICTION_MPS
-from carlab.benchmark.effects.tyre_forms import driven_wheels, placed, replace_tyres, saturating, slipping
+from carlab.benchmark.effects.tyre_forms import driven_wheels, other_tyres, placed, saturating, slipping
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.physics import Instant, World
 
@@ -63,8 +63,12 @@ def scrub(now: Instant, p: Parameters, car: BaseCar) -> None:
     now.push_x -= p["coefficient"] * abs(math.tan(now.d)) * math.tanh(now.vx / 0.1)
 
 
-def brush_shape(slope: float) -> Callable[[float], float]:
-    """Brush tyre (Pacejka, "Tyre and Vehicle Dynamics", section 3.2): parabolic pressure, full sliding at 3 / slope."""
+def brush_shape(b: float, c: float) -> Callable[[float], float]:
+    """Brush tyre with the slope B C at zero slip; parabolic pressure, full sliding at 3 / (B C).
+
+    Source: Pacejka, "Tyre and Vehicle Dynamics", section 3.2.
+    """
+    slope = b * c
 
     def shape(a: float) -> float:
         z = slope * a / 3.0
@@ -75,11 +79,6 @@ def brush_shape(slope: float) -> Callable[[float], float]:
     return shape
 
 
-def brush_tyre(world: World, p: Parameters) -> None:
-    """A brush tyre with the slope and friction of the magic formula."""
-    replace_tyres(world, p, lambda b, c: brush_shape(b * c))
-
-
 @hook("tyre")
 def combined_slip(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Side force times cos(atan(k)), k = scale F_x / (mu F_z).
@@ -88,11 +87,6 @@ def combined_slip(now: Instant, p: Parameters, car: BaseCar) -> None:
     Dynamics", section 4.3.2), with force in place of slip.
     """
     now.fr /= math.hypot(1.0, p["scale"] * now.fx / (now.mu_r * now.fz_r))
-
-
-def brush_slip(world: World, p: Parameters) -> None:
-    """Wheel speed as a state with the slip curve of a brush tyre."""
-    driven_wheels(world, p, brush_shape(1.0))
 
 
 def slip_relaxation(world: World, p: Parameters) -> None:
@@ -212,9 +206,9 @@ FORMS = (
     Form("rolling_resistance", "other", plain("force"), stribeck, 0.05, 2.0),
     Form("aerodynamic_drag", "other", drag_parameters, powered_drag, 0.05, 1.5),
     Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
-    Form("tyre_saturation", "other", saturating, brush_tyre, 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("tyre_saturation", "other", saturating, other_tyres(brush_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
-    Form("longitudinal_slip", "other", slipping, brush_slip, 1.0, 8.0, smallest=0.5),
+    Form("longitudinal_slip", "other", slipping, driven_wheels(brush_shape(1.0, 1.0)), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),
     Form("load_transfer", "other", plain("height"), pitching, 0.02, 0.2),
     Form("friction_drift", "other", signed("rate"), settling_grip, 0.0006, 0.007),

@@ -5,64 +5,41 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, hook, inverse, plain, signed
+from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, factor, hook, inverse, plain, signed
 from carlab.benchmark.world.base_car import BaseCar
-from carlab.benchmark.world.physics import Hook, Instant, World
+from carlab.benchmark.world.physics import Instant, World
 
 
-def delay_channels(world: World, channels: tuple[int, ...], extra_s: float) -> None:
-    """Delay channels (0 steering, 1 throttle)."""
-    for channel in channels:
+def delay(key: str, *channels: int) -> Attach:
+    """Delay of channels (0 steering, 1 throttle) in addition to that of the car file; may be negative."""
 
-        def later(t: float, before: Callable[[float], float] = world.arrival[channel]) -> float:
-            return before(t) + extra_s
+    def attach(world: World, p: Parameters) -> None:
+        for channel in channels:
 
-        world.arrival[channel] = later
+            def later(t: float, before: Callable[[float], float] = world.arrival[channel]) -> float:
+                return before(t) + p[key]
 
+            world.arrival[channel] = later
 
-def command_delay(world: World, p: Parameters) -> None:
-    """Delay of both channels in addition to that of the car file; may be negative."""
-    delay_channels(world, (0, 1), p["extra_delay"])
-
-
-def steering_delay(world: World, p: Parameters) -> None:
-    """Delay of steering."""
-    delay_channels(world, (0,), p["delay"])
+    return attach
 
 
-def throttle_delay(world: World, p: Parameters) -> None:
-    """Delay of throttle."""
-    delay_channels(world, (1,), p["delay"])
+def first_order(stage: str, name: str) -> Attach:
+    """First-order lag T dy/dt = input - y of a variable (``d`` wheel angle, ``u`` throttle) at a stage."""
 
+    def attach(world: World, p: Parameters) -> None:
+        time_constant_s = p["time_constant"]
+        if time_constant_s <= 0.0:
+            return
+        k = world.add_state()
 
-def first_order(world: World, time_constant_s: float, channel: str) -> Hook:
-    """T dy/dt = input - y for the wheel angle (``d``) or the throttle (``u``)."""
-    if time_constant_s <= 0.0:
-        return lambda now: None
-    k = world.add_state()
-    if channel == "d":
+        def lag(now: Instant) -> None:
+            now.rates[k] = (getattr(now, name) - now.extra[k]) / time_constant_s
+            setattr(now, name, now.extra[k])
 
-        def steer(now: Instant) -> None:
-            now.rates[k] = (now.d - now.extra[k]) / time_constant_s
-            now.d = now.extra[k]
+        world.hooks[stage].append(lag)
 
-        return steer
-
-    def push(now: Instant) -> None:
-        now.rates[k] = (now.u - now.extra[k]) / time_constant_s
-        now.u = now.extra[k]
-
-    return push
-
-
-def steering_lag(world: World, p: Parameters) -> None:
-    """First-order servo."""
-    world.hooks["steer"].append(first_order(world, p["time_constant"], "d"))
-
-
-def motor_lag(world: World, p: Parameters) -> None:
-    """First-order motor."""
-    world.hooks["throttle"].append(first_order(world, p["time_constant"], "u"))
+    return attach
 
 
 def steering_rate_limit(world: World, p: Parameters) -> None:
@@ -141,11 +118,11 @@ def extra_delay(size: float, draw: Draw) -> dict[str, float]:
 
 
 FORMS = (
-    Form("command_delay", "catalogue", extra_delay, command_delay, 0.01, 0.15),
-    Form("steering_delay", "catalogue", plain("delay"), steering_delay, 0.01, 0.2),
-    Form("throttle_delay", "catalogue", plain("delay"), throttle_delay, 0.03, 0.4),
-    Form("steering_lag", "catalogue", plain("time_constant"), steering_lag, 0.01, 0.4),
-    Form("motor_lag", "catalogue", plain("time_constant"), motor_lag, 0.03, 1.0),
+    Form("command_delay", "catalogue", extra_delay, delay("extra_delay", 0, 1), 0.01, 0.15),
+    Form("steering_delay", "catalogue", plain("delay"), delay("delay", 0), 0.01, 0.2),
+    Form("throttle_delay", "catalogue", plain("delay"), delay("delay", 1), 0.03, 0.4),
+    Form("steering_lag", "catalogue", plain("time_constant"), first_order("steer", "d"), 0.01, 0.4),
+    Form("motor_lag", "catalogue", plain("time_constant"), first_order("throttle", "u"), 0.03, 1.0),
     Form("steering_rate_limit", "catalogue", inverse("rate"), steering_rate_limit, 0.1, 1.5),
     Form("steering_deadband", "catalogue", plain("width"), steering_deadband, 0.01, 0.4),
     Form("steering_backlash", "catalogue", plain("play"), steering_backlash, 0.01, 0.4),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, hook, plain, signed
+from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, hook, plain, signed
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.physics import Instant, World, pacejka_shape
 
@@ -25,20 +25,19 @@ def saturating(size: float, draw: Draw) -> dict[str, float]:
     }
 
 
-def tyre_saturation(world: World, p: Parameters) -> None:
-    """The magic formula instead of the linear tyre of the car file."""
-    replace_tyres(world, p, pacejka_shape)
+def other_tyres(shape: Callable[[float, float], Callable[[float], float]]) -> Attach:
+    """Other tyres on both axles instead of the linear ones: a curve by B and C, and their friction."""
 
+    def attach(world: World, p: Parameters) -> None:
+        world.shape_front = shape(p["B_front"], p["C_front"])
+        world.shape_rear = shape(p["B_rear"], p["C_rear"])
 
-def replace_tyres(world: World, p: Parameters, shape: Callable[[float, float], Callable[[float], float]]) -> None:
-    """Other tyres on both axles: a curve by B and C, and their friction."""
-    world.shape_front = shape(p["B_front"], p["C_front"])
-    world.shape_rear = shape(p["B_rear"], p["C_rear"])
+        def grip(now: Instant) -> None:
+            now.mu_f, now.mu_r = p["mu_front"], p["mu_rear"]
 
-    def grip(now: Instant) -> None:
-        now.mu_f, now.mu_r = p["mu_front"], p["mu_rear"]
+        world.hooks["grip"].insert(0, grip)
 
-    world.hooks["grip"].insert(0, grip)
+    return attach
 
 
 @hook("tyre")
@@ -48,27 +47,26 @@ def friction_ellipse(now: Instant, p: Parameters, car: BaseCar) -> None:
     now.fr *= math.sqrt(1.0 - used * used)
 
 
-def longitudinal_slip(world: World, p: Parameters) -> None:
+def driven_wheels(curve: Callable[[float], float]) -> Attach:
     """Wheel speed as a state: J dw/dt = T - R F_x; slope ``stiffness`` at zero slip, friction of the axle at most.
 
-    The catalogue leaves F_x(slip) open; a hyperbolic tangent between slope and limit is the usual choice.
+    The catalogue leaves F_x(slip) open; ``curve`` goes from slope one at no slip to one at the limit.
     """
-    driven_wheels(world, p, math.tanh)
 
+    def attach(world: World, p: Parameters) -> None:
+        inertia, stiffness = p["inertia"] / WHEEL_RADIUS_M**2, p["stiffness"]
+        k = world.add_state(rolling=True)
 
-def driven_wheels(world: World, p: Parameters, curve: Callable[[float], float]) -> None:
-    """Speed of the driven wheels as a state; ``curve`` goes from slope one at no slip to one at the limit."""
-    inertia, stiffness = p["inertia"] / WHEEL_RADIUS_M**2, p["stiffness"]
-    k = world.add_state(rolling=True)
+        def spin(now: Instant) -> None:
+            slip = (now.extra[k] - now.vx) / max(abs(now.vx), 0.3)
+            top = now.mu_r * now.fz_r
+            force = top * curve(stiffness * slip / top)
+            now.rates[k] = (now.fx - force) / inertia
+            now.fx = force
 
-    def spin(now: Instant) -> None:
-        slip = (now.extra[k] - now.vx) / max(abs(now.vx), 0.3)
-        top = now.mu_r * now.fz_r
-        force = top * curve(stiffness * slip / top)
-        now.rates[k] = (now.fx - force) / inertia
-        now.fx = force
+        world.hooks["limit"].append(spin)
 
-    world.hooks["limit"].append(spin)
+    return attach
 
 
 def tyre_relaxation(world: World, p: Parameters) -> None:
@@ -158,9 +156,9 @@ def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 
 FORMS = (
-    Form("tyre_saturation", "catalogue", saturating, tyre_saturation, 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
-    Form("longitudinal_slip", "catalogue", slipping, longitudinal_slip, 1.0, 8.0, smallest=0.5),
+    Form("longitudinal_slip", "catalogue", slipping, driven_wheels(math.tanh), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),
     Form("load_transfer", "catalogue", plain("height"), load_transfer, 0.02, 0.2),
     Form("roll_dynamics", "other", roll_parameters, roll_dynamics, 0.3, 4.0),
