@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -124,10 +124,8 @@ def _killed_with_this_process(pid: int) -> Iterator[None]:
 
 
 def _kill_session(pid: int) -> None:
-    try:
+    with suppress(ProcessLookupError):  # the process has ended
         os.killpg(pid, signal.SIGKILL)
-    except ProcessLookupError:
-        return  # the process has ended
 
 
 def run_parallel(
@@ -145,27 +143,17 @@ def run_parallel(
     """
     remaining = iter(tasks)
     running: dict[Future[Result], Task] = {}
-    more = True
+    more, stopped = True, False
     with ThreadPoolExecutor(jobs) as pool:
         while more or running:
             while more and len(running) < jobs:
                 task = next(remaining, None)
-                if task is None:
+                stopped = task is not None and stop_requested()
+                if task is None or stopped:
                     more = False
-                elif stop_requested():
-                    _drain(running, finished)
-                    return False
                 else:
                     running[pool.submit(work, task)] = task
             # A time-out lets the main thread receive signals.
             for future in wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done:
                 finished(running.pop(future), future.result())
-    return True
-
-
-def _drain(running: Mapping[Future[Result], Task], finished: Callable[[Task, Result], None]) -> None:
-    pending = set(running)
-    while pending:
-        done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
-        for future in done:
-            finished(running[future], future.result())
+    return not stopped

@@ -12,7 +12,6 @@ import platform
 import socket
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from types import TracebackType
 from typing import Any
 
 from carlab.core.clock import MonotonicClock
@@ -56,13 +55,13 @@ class RayExecutor:
         resource = "GPU" if self.gpu else "CPU"
         self.jobs = int(self._ray.cluster_resources().get(resource, 0))
         if self.jobs < 1:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise ConfigError(
                 f"--ray {self.address}: the cluster has no {resource}; add a machine, or use --device cpu."
             )
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """Disconnect; a local cluster ends."""
         if self._ray is not None:
             self._ray.shutdown()
