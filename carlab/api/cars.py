@@ -37,12 +37,13 @@ def car_options_text(
     dry_run: bool = False,
 ) -> str:
     """Command-line options that select a car, each with a leading space; options with default values are omitted."""
-    words = [] if car == "sim" else ["--car", _word(car)]
-    words += [] if vehicle is None else ["--vehicle", _word(vehicle)]
+    words = [] if car == "sim" else ["--car", car_name(car)]
+    words += [] if vehicle is None else ["--vehicle", car_name(vehicle)]
     words += ["--dry-run"] if dry_run else []
-    words += [] if reality is None else ["--reality", _word(reality)]
+    words += [] if reality is None else ["--reality", car_name(reality)]
     return "".join(f" {shlex.quote(word)}" for word in words)
 
 
-def _word(car: str | Path | CarFile) -> str:
+def car_name(car: str | Path | CarFile) -> str:
+    """The name or path of a car, as on the command line."""
     return str(car) if isinstance(car, (str, Path)) else car.name

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from carlab.api.cars import car_options_text
+from carlab.api.cars import car_name, car_options_text
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
 from carlab.experiment.cluster.settings import LinkSettings
@@ -110,7 +110,7 @@ def _prior(request: LearnRequest, choice: CarChoice) -> SimulatorConfig:
         kind: Literal["kinematic", "nominal"] = "kinematic" if request.prior == "kinematic" else "nominal"
         return prior_simulator(choice.simulator, kind)
     simulator = prior_simulator(_prior_file(request.prior).simulator, "nominal")
-    check_period(simulator, choice.control_period_s, f"car '{_name_of(request.car)}'")
+    check_period(simulator, choice.control_period_s, f"car '{car_name(request.car)}'")
     return simulator
 
 
@@ -123,10 +123,6 @@ def _prior_file(prior: str | Path | CarFile) -> CarFile:
     if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
         raise ConfigError(f"--prior {prior}: give {', '.join(BUILT_IN_PRIORS)} or an existing car file.")
     return load_car_file(file)
-
-
-def _name_of(car: str | Path | CarFile) -> str:
-    return str(car) if isinstance(car, (str, Path)) else car.name
 
 
 def checked_simulator(request: LearnRequest) -> SimulatorConfig | None:

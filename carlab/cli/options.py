@@ -65,8 +65,8 @@ def arguments_of(verb: Any, call: Callable[..., Any]) -> dict[str, Any]:
     return {name: values[name] for name in inspect.signature(call).parameters if name in values}
 
 
-def new_file(path: Path, option: str, suffix: str) -> Path:
-    """Return a path for a new file, before the work begins; its folder may be missing.
+def new_file(path: Path, option: str, suffix: str) -> None:
+    """Check the path of a new file before the work begins; its folder may be missing.
 
     Raises:
         ConfigError: the name has another suffix.
@@ -77,17 +77,15 @@ def new_file(path: Path, option: str, suffix: str) -> Path:
     if path.exists():
         raise DataError(f"{path} exists already; remove it or choose another {option}.")
     _check_folder(path.parent, f"{option} {path}")
-    return path
 
 
-def report_folder(folder: Path) -> Path:
-    """Return a folder for a report, before the work begins; an earlier report in it will be replaced.
+def report_folder(folder: Path) -> None:
+    """Check the folder of a report before the work begins; an earlier report in it will be replaced.
 
     Raises:
         DataError: it cannot be created or written.
     """
     _check_folder(folder, f"--out {folder}")
-    return folder
 
 
 def _check_folder(folder: Path, where: str) -> None:
@@ -99,17 +97,16 @@ def _check_folder(folder: Path, where: str) -> None:
         raise DataError(f"{where}: {existing} is not writable; choose another folder or change its permissions.")
 
 
-def json_file(path: Path, option: str) -> Path:
-    """Return a path for a JSON file. Raises ConfigError for another suffix or a missing folder."""
+def json_file(path: Path, option: str) -> None:
+    """Check the path of a JSON file. Raises ConfigError for another suffix or a missing folder."""
     if path.suffix != ".json" or path.is_dir():
         raise ConfigError(f"{option} {path}: name a file that ends in .json.")
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first.")
-    return path
 
 
-def log_file(path: Path, option: str) -> Path:
-    """Return a path to which lines will be appended; the file may exist already.
+def log_file(path: Path, option: str) -> None:
+    """Check the path of a file to which lines will be appended; it may exist already.
 
     Raises:
         ConfigError: the path is a folder, or its folder is missing.
@@ -123,4 +120,3 @@ def log_file(path: Path, option: str) -> Path:
         _check_folder(path.parent, f"{option} {path}")
     elif not os.access(path, os.W_OK):
         raise DataError(f"{option} {path}: it is not writable; choose another file or change its permissions.")
-    return path

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED
-from carlab.core.clock import MonotonicClock
+from carlab.core.clock import MonotonicClock, wall_clock_ns
 from carlab.core.errors import ConfigError
+from carlab.core.version import VERSION
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -260,12 +263,6 @@ class Prove:
         return 0
 
     def _facts(self, seeds: Sequence[int], runs: Mapping[str, Any]) -> dict[str, str]:
-        import os
-        from datetime import datetime
-
-        from carlab.core.clock import wall_clock_ns
-        from carlab.core.version import VERSION
-
         memory = [run["peak_memory_mib"] for run in runs.values()]
         jobs = sorted({int(run["jobs"]) for run in runs.values()})
         return {
