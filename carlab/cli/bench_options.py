@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -138,34 +137,10 @@ class BenchOptions:
     """Show the whole log."""
 
 
-@dataclass(frozen=True, slots=True)
-class Study:
-    """A use of ``carlab bench``.
-
-    Attributes:
-        command: text for messages.
-        applies_to: whether given options belong to this use.
-    """
-
-    command: str
-    applies_to: Callable[[BenchOptions], bool]
-
-
-SPEED = Study("'bench speed'", lambda given: given.what == "speed")
-REGRESSION = Study("'bench regression'", lambda given: given.what == "regression")
-REALCAR = Study(
-    "'bench regression --case realcar'", lambda given: REGRESSION.applies_to(given) and given.case == "realcar"
-)
-PENDULUM = Study(
-    "'bench regression --case pendulum'",
-    lambda given: REGRESSION.applies_to(given) and given.case.startswith("pendulum"),
-)
-PRIORS = Study("'bench priors'", lambda given: given.what == "priors")
-READ = Study("'bench priors --data FOLDER'", lambda given: PRIORS.applies_to(given) and given.data is not None)
-CONCEALED = Study("'bench priors' without --data", lambda given: PRIORS.applies_to(given) and given.data is None)
-PARKING = Study("'bench parking'", lambda given: given.what == "parking")
-ROLLOUTS = Study("'bench rollouts'", lambda given: given.what == "rollouts")
-REALCARS = Study("'bench realcars'", lambda given: given.what == "realcars")
+SPEED, REGRESSION, PRIORS = "'bench speed'", "'bench regression'", "'bench priors'"
+PARKING, ROLLOUTS, REALCARS = "'bench parking'", "'bench rollouts'", "'bench realcars'"
+REALCAR, PENDULUM = "'bench regression --case realcar'", "'bench regression --case pendulum'"
+READ, CONCEALED = "'bench priors --data FOLDER'", "'bench priors' without --data"
 
 EVERYWHERE = frozenset({"what", "out", "device", "verbose"})
 STUDIES_OF_OPTION = {
@@ -198,6 +173,18 @@ STUDIES_OF_OPTION = {
 """Uses in which an option has an effect, for options without an effect in all uses."""
 
 
+def uses(given: BenchOptions) -> set[str]:
+    """The uses of ``carlab bench`` that options belong to, as messages name them."""
+    found = {f"'bench {given.what}'"}
+    if given.what == "regression" and given.case == "realcar":
+        found.add(REALCAR)
+    if given.what == "regression" and given.case.startswith("pendulum"):
+        found.add(PENDULUM)
+    if given.what == "priors":
+        found.add(CONCEALED if given.data is None else READ)
+    return found
+
+
 def check_options(given: BenchOptions) -> None:
     """Check that every given option has an effect.
 
@@ -208,13 +195,13 @@ def check_options(given: BenchOptions) -> None:
         name = option.name
         if name in EVERYWHERE or getattr(given, name) == option.default:
             continue
-        if not any(study.applies_to(given) for study in STUDIES_OF_OPTION[name]):
-            studies = " and ".join(study.command for study in STUDIES_OF_OPTION[name])
+        if uses(given).isdisjoint(STUDIES_OF_OPTION[name]):
+            studies = " and ".join(STUDIES_OF_OPTION[name])
             raise ConfigError(
                 f"--{name.replace('_', '-')} has no effect in '{_command(given)}'; use it with {studies}."
             )
-    if "all" in given.rows and not ROLLOUTS.applies_to(given):
-        raise ConfigError(f"--rows all has no effect in '{_command(given)}'; use it with {ROLLOUTS.command}.")
+    if "all" in given.rows and given.what != "rollouts":
+        raise ConfigError(f"--rows all has no effect in '{_command(given)}'; use it with {ROLLOUTS}.")
 
 
 def row_counts(given: BenchOptions) -> tuple[int, ...]:
@@ -225,6 +212,6 @@ def row_counts(given: BenchOptions) -> tuple[int, ...]:
 def _command(given: BenchOptions) -> str:
     """The command with the options that determine its use."""
     command = f"bench {given.what}"
-    if REGRESSION.applies_to(given):
+    if given.what == "regression":
         return f"{command} --case {given.case}"
-    return f"{command} --data {given.data}" if READ.applies_to(given) else command
+    return f"{command} --data {given.data}" if READ in uses(given) else command
