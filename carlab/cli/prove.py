@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED
-from carlab.core.clock import MonotonicClock, wall_clock_ns
+from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import ConfigError
 from carlab.core.version import VERSION
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from carlab.benchmark.cases.proof_set import CaseSpec
     from carlab.benchmark.proof.runner import Proof
-    from carlab.experiment.episodes.interrupts import Interrupts
-    from carlab.jobs.child_jobs import Executor
 
 STAGES = {
     "make": "cases made",
@@ -38,6 +36,7 @@ STAGES = {
 FOR_RECORDINGS = ("data", "car", "tool")
 """Options of ``--set real`` alone."""
 DAY_S = 86400.0
+AnyProof = TypeVar("AnyProof")
 
 
 @dataclass
@@ -108,7 +107,6 @@ class Prove:
         """Create and seal the cases, diagnose them, open the seal, and score."""
         from carlab.benchmark.baselines.run import require_studies
         from carlab.benchmark.proof.runner import DIAGNOSE, Proof
-        from carlab.experiment.episodes.interrupts import Interrupts
 
         above_zero(jobs=self.jobs, timeout=self.timeout)
         valid_seed(seed=self.seed)
@@ -123,16 +121,25 @@ class Prove:
             return self._calibrate(Proof(self.out, specs))
         if self.baselines:
             require_studies()
-        with Interrupts() as interrupts, self._executor() as executor, progress(speed_estimate_period_s=DAY_S) as bar:
-            stages = _Bar(bar)
-            proof = Proof(
-                self.out, specs, command=DIAGNOSE, progress=stages, timeout_s=self.timeout, executor=executor,
+        proof = self._run(partial(Proof, self.out, specs, command=DIAGNOSE), self._stages)
+        return EXIT_INTERRUPTED if proof is None else self._score(proof)
+
+    def _run(self, make: Callable[..., AnyProof], stages: Callable[[AnyProof], bool]) -> AnyProof | None:
+        """Make a proof with the options of its run, and run its stages; None if it is stopped."""
+        from carlab.experiment.episodes.interrupts import Interrupts
+        from carlab.jobs.ray_executor import chosen_executor
+
+        executor_of_options = chosen_executor(self.ray, self.jobs)
+        with Interrupts() as interrupts, executor_of_options as executor, progress(DAY_S) as bar:
+            shown = _Bar(bar)
+            proof = make(
+                progress=shown, timeout_s=self.timeout, executor=executor,
                 stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
             )  # fmt: skip
-            if not self._stages(proof, interrupts):
-                fail(f"Stopped with {stages.last}; run the same command to continue.")
-                return EXIT_INTERRUPTED
-        return self._score(proof)
+            if stages(proof) and not interrupts.requested.is_set():
+                return proof
+            fail(f"Stopped with {shown.last}; run the same command to continue.")
+            return None
 
     def _check_options(self) -> None:
         """Raise ConfigError if an option is given that has no effect."""
@@ -147,29 +154,16 @@ class Prove:
     def _real(self) -> int:
         from carlab.benchmark.real.runner import RealProof, drawn_specs
         from carlab.cli.prove_real import car_path, run_stages, score, tables_in
-        from carlab.experiment.episodes.interrupts import Interrupts
         from carlab.jobs.child_jobs import CARLAB
 
         car, recordings = car_path(self.car, self.out), tables_in(self.data)
         specs, refused = drawn_specs(self.seed, self.limit, recordings)
         if refused:
             console.print(f"Not concealed, because commands would leave [-1, 1]: {', '.join(refused)}.")
-        with Interrupts() as interrupts, self._executor() as executor, progress(speed_estimate_period_s=DAY_S) as bar:
-            stages = _Bar(bar)
-            proof = RealProof(
-                self.out, specs, recordings, car, tool=self.tool, command=CARLAB, progress=stages,
-                timeout_s=self.timeout, executor=executor, stop_requested=interrupts.requested.is_set,
-                abandon=interrupts.urgent.is_set,
-            )  # fmt: skip
-            if not run_stages(proof):
-                fail(f"Stopped with {stages.last}; run the same command to continue.")
-                return EXIT_INTERRUPTED
+        make = partial(RealProof, self.out, specs, recordings, car, tool=self.tool, command=CARLAB)
+        if (proof := self._run(make, run_stages)) is None:
+            return EXIT_INTERRUPTED
         return score(proof, self.out, lambda runs: self._facts([spec.seed for spec in specs], runs))
-
-    def _executor(self) -> AbstractContextManager[Executor]:
-        from carlab.jobs.ray_executor import chosen_executor
-
-        return chosen_executor(self.ray, self.jobs)
 
     def _study(self) -> int:
         from carlab.benchmark.public_simulators.commonroad import require_public_simulator
@@ -208,14 +202,11 @@ class Prove:
         table(f"{len(decisions)} cases; * marks the present value", list(COLUMNS), [r.row() for r in rates])
         return 0
 
-    def _stages(self, proof: Proof, interrupts: Interrupts) -> bool:
+    def _stages(self, proof: Proof) -> bool:
+        """Run the stages of a proof until one is stopped; whether all are done."""
         if proof.make() is None or not proof.diagnose():
             return False
-        if self.oracle and not proof.diagnose(oracle=True):
-            return False
-        if self.baselines and not proof.baselines():
-            return False
-        return not interrupts.requested.is_set()
+        return (not self.oracle or proof.diagnose(oracle=True)) and (not self.baselines or proof.baselines())
 
     def _specs(self) -> list[CaseSpec]:
         from carlab.benchmark.cases.hard_set import drawn_evenly, hard_set
@@ -281,8 +272,6 @@ class _Bar:
         self.last = "nothing done"
         self._bar = bar
         self._tasks: dict[str, TaskID] = {}
-        self._clock = MonotonicClock()
-        self._began: dict[str, tuple[float, int]] = {}
 
     def __call__(self, stage: str, done: int, total: int, note: str) -> None:
         """Take one report of the proof."""
@@ -294,11 +283,8 @@ class _Bar:
             self._tasks[stage] = self._bar.add_task(STAGES[stage], total=total, completed=done, note="")
         self._bar.update(self._tasks[stage], completed=done)
         if self._bar.disable and (done == total or done % max(1, total // 20) == 0):
-            self._bar.console.print(self.last + self._time_left(stage, done, total))
+            self._bar.console.print(self.last + self._time_left(stage))
 
-    def _time_left(self, stage: str, done: int, total: int) -> str:
-        now_s = self._clock.now_s()
-        since_s, before = self._began.setdefault(stage, (now_s, done))
-        if done in (before, total):
-            return ""
-        return f", about {(now_s - since_s) / (done - before) * (total - done) / 60.0:.0f} min left"
+    def _time_left(self, stage: str) -> str:
+        remaining_s = next(task.time_remaining for task in self._bar.tasks if task.id == self._tasks[stage])
+        return f", about {remaining_s / 60.0:.0f} min left" if remaining_s else ""
