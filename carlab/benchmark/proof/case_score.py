@@ -143,8 +143,8 @@ def _single(row: dict[str, Any], answer: Json, named: list[dict[str, Any]], same
     row["channel_right"] = bool(channels) and channels[0] in answer["main_channels"]
     if truth["lag_s"] is not None:
         lag = where.get("lag_s")
-        row["lag_error_s"] = abs(lag - truth["lag_s"]) if _number(lag) else None
-        row["lag_right"] = _number(lag) and abs(lag - truth["lag_s"]) <= LAG_WITHIN_S
+        row["lag_error_s"] = abs(lag - truth["lag_s"]) if lag is not None else None
+        row["lag_right"] = lag is not None and abs(lag - truth["lag_s"]) <= LAG_WITHIN_S
     if truth["time"] is not None:
         row["time_right"] = truth["time"] in str(where.get("time")).lower()
     if truth["place"] is not None:
@@ -157,7 +157,7 @@ def _parameters(found: Json, true: Json) -> dict[str, dict[str, Any]]:
     rows = {}
     for name, value in true.items():
         entry = found.get(name)
-        if not isinstance(entry, Mapping) or not _number(entry.get("value")):
+        if entry is None or entry["value"] is None:
             continue
         error = entry["value"] - value
         if name == "direction":
@@ -168,7 +168,7 @@ def _parameters(found: Json, true: Json) -> dict[str, dict[str, Any]]:
             "true": value,
             "value": entry["value"],
             "relative_error": abs(error) / abs(value) if value else None,
-            "covered": low <= true_near_estimate <= high if _number(low) and _number(high) else None,
+            "covered": low <= true_near_estimate <= high if low is not None and high is not None else None,
         }
     return rows
 
@@ -201,20 +201,8 @@ def _ratios(row: dict[str, Any], report: Json | None, oracle: Json | None) -> No
 def _score(report: Json | None, which: str) -> float | None:
     held = ((report or {}).get("fit") or {}).get("held_out") or {}
     value = (held.get(which) or {}).get("score")
-    return float(value) if value is not None and _number(value) else None
+    return None if value is None else float(value)
 
 
-def _near(place: Any, true: Json) -> bool:
-    if isinstance(place, Mapping):
-        x, y = place.get("x"), place.get("y")
-    elif isinstance(place, (list, tuple)) and len(place) >= 2:
-        x, y = place[0], place[1]
-    else:
-        return False
-    if not isinstance(x, (int, float)) or not isinstance(y, (int, float)):
-        return False
-    return math.hypot(x - true["x"], y - true["y"]) <= float(true["radius"])
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+def _near(place: Json | None, true: Json) -> bool:
+    return place is not None and math.dist((place["x"], place["y"]), (true["x"], true["y"])) <= float(true["radius"])
