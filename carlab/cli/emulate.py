@@ -11,7 +11,7 @@ from rich.text import Text
 
 from carlab.api.arguments import valid_seed
 from carlab.cli.console import console
-from carlab.cli.options import log_file
+from carlab.cli.options import arguments_of, log_file
 from carlab.core.errors import ConfigError, NotReadyError
 
 
@@ -68,18 +68,11 @@ class Emulate:
         self._check_options()
         valid_seed(seed=self.seed)
         file = default_car() if self.vehicle is None else load_car_file(self.vehicle)
-        config = WorldConfig(
-            simulator=file.simulator.to_tables(),
-            actuator=self.actuator,
-            seed=self.seed,
-            log="" if self.log is None else str(self.log),
-            serial_link=str(self.port.absolute()) if self.actuator == "serial" else "",
-            can_channel=self.can_channel,
-            command_port=self.command_port,
-            data_port=self.data_port,
-            mode=self.mode,
-            bitstream=self.bitstream,
-        )
+        paths = {
+            "log": "" if self.log is None else str(self.log),
+            "serial_link": str(self.port.absolute()) if self.actuator == "serial" else "",
+        }
+        config = WorldConfig(file.simulator.to_tables(), **arguments_of(self, WorldConfig) | paths)
         with Interrupts() as interrupts, World(config) as world:
             addresses = world.addresses
             console.print(Text("EMULATED", "bold"), " Car file for a program on this host:")

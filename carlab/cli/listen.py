@@ -10,6 +10,7 @@ from rich.text import Text
 
 from carlab.api.arguments import above_zero
 from carlab.cli.console import console, fail, table
+from carlab.cli.options import arguments_of
 from carlab.core.errors import ConfigError
 
 
@@ -59,16 +60,7 @@ class Listen:
         from mocap.rigid_body import RigidBodyPoseSource
 
         above_zero(seconds=self.seconds)
-        config = MocapConfig(
-            server_address=self.server,
-            local_interface=self.interface,
-            mode=self.mode,
-            command_port=self.command_port,
-            body=self.body,
-            body_id=self.body_id,
-            bitstream=self.bitstream,
-            up_axis=self.up_axis,
-        )
+        config = MocapConfig(self.server, self.interface, **arguments_of(self, MocapConfig))
         if self.car is not None:
             real = load_car_file(self.car).real
             if real is None:

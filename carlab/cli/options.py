@@ -57,7 +57,7 @@ class TaskOptions:
 
 
 def arguments_of(verb: Any, call: Callable[..., Any]) -> dict[str, Any]:
-    """The options of a verb that are arguments of a call of the Python interface, by name."""
+    """The options of a verb that are arguments of a function or class, by name."""
     values = dict(vars(verb))
     for group in ("car", "task"):
         if is_dataclass(values.get(group)):
