@@ -7,8 +7,6 @@ Commands (N,) are shares of full command; row k holds from its stamp to the next
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -112,8 +110,3 @@ def filtered_velocity(table: Table, time_constant_s: float) -> Table:
     velocity = np.stack([table["vx"], table["vy"], table["yaw_rate"]], axis=1)
     filtered = ramp_filter(table["t"], velocity, time_constant_s)
     return {**table, **dict(zip(("vx", "vy", "yaw_rate"), filtered.T, strict=True))}
-
-
-def with_command(table: Table, name: str, change: Callable[[FloatArray], FloatArray]) -> Table:
-    """The table with a changed command column; ``change`` maps (N,) to (N,)."""
-    return {**table, name: change(table[name])}

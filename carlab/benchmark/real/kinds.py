@@ -97,54 +97,54 @@ def _lag(channel: str) -> Callable[[Table, float, float], TransformedRecording]:
 
 def _gain(table: Table, size: float, draw: float) -> TransformedRecording:
     gain = (1.0 + size) ** _sign(draw)
-    moved = c.with_command(table, "steering", lambda u: u / gain)
-    return TransformedRecording(moved, (Truth("value", gain, "multiplies"),))
+    changed = {**table, "steering": table["steering"] / gain}
+    return TransformedRecording(changed, (Truth("value", gain, "multiplies"),))
 
 
 def _offset(table: Table, size: float, draw: float) -> TransformedRecording:
     shift = _sign(draw) * size * FULL_LOCK
-    moved = c.with_command(table, "steering", lambda u: u - shift)
-    return TransformedRecording(moved, (Truth("angle", shift, per_lock=True),))
+    changed = {**table, "steering": table["steering"] - shift}
+    return TransformedRecording(changed, (Truth("angle", shift, per_lock=True),))
 
 
 def _asymmetry(table: Table, size: float, draw: float) -> TransformedRecording:
     gain = _sign(draw) * size
-    moved = c.with_command(table, "steering", lambda u: u / (1.0 + gain * np.sign(u)))
-    return TransformedRecording(moved, (Truth("gain", gain),))
+    changed = {**table, "steering": table["steering"] / (1.0 + gain * np.sign(table["steering"]))}
+    return TransformedRecording(changed, (Truth("gain", gain),))
 
 
 def _steering_dead_band(table: Table, size: float, draw: float) -> TransformedRecording:
     width = size * FULL_LOCK
-    moved = c.with_command(table, "steering", lambda u: c.before_dead_band(u, 0.5 * width))
-    return TransformedRecording(moved, (Truth("width", width, per_lock=True),))
+    changed = {**table, "steering": c.before_dead_band(table["steering"], 0.5 * width)}
+    return TransformedRecording(changed, (Truth("width", width, per_lock=True),))
 
 
 def _play(table: Table, size: float, draw: float) -> TransformedRecording:
     play = size * FULL_LOCK
-    moved = c.with_command(table, "steering", lambda u: c.before_play(u, play))
-    return TransformedRecording(moved, (Truth("play", play, per_lock=True),))
+    changed = {**table, "steering": c.before_play(table["steering"], play)}
+    return TransformedRecording(changed, (Truth("play", play, per_lock=True),))
 
 
 def _saturation(table: Table, size: float, draw: float) -> TransformedRecording:
     """``size``: the share by which the angle at full lock is smaller than a linear one."""
     x = float(np.interp(size, 1.0 - np.tanh(_ARGUMENTS) / _ARGUMENTS, _ARGUMENTS))  # tanh(x) = (1 - size) x
     saturation = FULL_LOCK / math.tanh(x)
-    moved = c.with_command(table, "steering", lambda u: c.before_saturation(u, saturation))
-    return TransformedRecording(moved, (Truth("saturation", saturation, "replaces", per_lock=True),))
+    changed = {**table, "steering": c.before_saturation(table["steering"], saturation)}
+    return TransformedRecording(changed, (Truth("saturation", saturation, "replaces", per_lock=True),))
 
 
 _ARGUMENTS = np.linspace(0.01, 2.0, 400)
 
 
 def _throttle_dead_band(table: Table, size: float, draw: float) -> TransformedRecording:
-    moved = c.with_command(table, "throttle", lambda u: c.before_dead_band(u * (1.0 - size), size))
-    return TransformedRecording(moved, (Truth("width", size),))
+    changed = {**table, "throttle": c.before_dead_band(table["throttle"] * (1.0 - size), size)}
+    return TransformedRecording(changed, (Truth("width", size),))
 
 
 def _exponent(table: Table, size: float, draw: float) -> TransformedRecording:
     exponent = (1.0 + size) ** _sign(draw)
-    moved = c.with_command(table, "throttle", lambda u: np.sign(u) * np.abs(u) ** (1.0 / exponent))
-    return TransformedRecording(moved, (Truth("exponent", exponent, "multiplies"),))
+    changed = {**table, "throttle": np.sign(table["throttle"]) * np.abs(table["throttle"]) ** (1.0 / exponent)}
+    return TransformedRecording(changed, (Truth("exponent", exponent, "multiplies"),))
 
 
 def _marker(table: Table, size: float, draw: float) -> TransformedRecording:
