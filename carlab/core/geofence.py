@@ -44,7 +44,7 @@ def contains(corners_m: Polygon, x_m: Any, y_m: Any) -> Any:
 
 def free_distances_m(corners_m: Polygon, places_m: FloatArray, heading_rad: FloatArray) -> FloatArray:
     """Distances (n,) [m] from points (n, 2) along headings (n,) to the polygon's nearest edge; inf without an edge."""
-    corners = corners_array(corners_m)
+    corners = np.asarray(corners_m, dtype=np.float64)
     before = np.roll(corners, 1, axis=0)
     edge = corners - before
     to = before - places_m[:, None]  # (n, edges, 2)
@@ -98,8 +98,3 @@ def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
 def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) -> tuple[tuple[float, float], ...]:
     """Corners of a rectangle, counter-clockwise."""
     return ((x_low_m, y_low_m), (x_high_m, y_low_m), (x_high_m, y_high_m), (x_low_m, y_high_m))
-
-
-def corners_array(corners_m: Polygon) -> FloatArray:
-    """Corners as an array (n, 2) [m]."""
-    return np.asarray(corners_m, dtype=np.float64).reshape(-1, 2)
