@@ -69,7 +69,7 @@ def test_force_over_speed_accelerates_as_its_closed_form(output: int) -> None:
     states[:, 3] = np.linspace(0.0, 3.0, 6)
     still = np.zeros((6, 2))
     times = np.arange(6) * 0.01
-    driven = Drive(times, still, times, states, 1, np.zeros(1), still[:1])
+    driven = Drive(times, still, times, states, 1)
     world = World(CAR)
     FORMS[("random_force_over_speed", "random")].attach(world, {"size": size, "seed": seed, "output": output})
     field = RandomField(seed, 1)(states[:, 3:4] / SPEED_SCALE_MPS)

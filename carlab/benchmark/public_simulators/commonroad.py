@@ -217,9 +217,7 @@ def _integrate(
         commands[tick] = driver(tick * period, car.motion(run.newest_capture)[0])
         run.issue(tick * period, *commands[tick].tolist())
         run.advance((tick + 1) * period)
-    switches = np.array(run.switches)
-    motion = car.motion(run.states)
-    return Drive(row_s, commands, capture_s, motion, per_row, switches[:, 0], switches[:, 1:]), run.states
+    return Drive(row_s, commands, capture_s, car.motion(run.states), per_row), run.states
 
 
 class _Integration:
@@ -232,7 +230,6 @@ class _Integration:
 
     Attributes:
         states: States (N, n) at the captures.
-        switches: Time [s], wheel angle [rad] and acceleration [m/s2] of each change of the acting inputs.
     """
 
     def __init__(self, car: PublicCar, state: FloatArray, capture_s: FloatArray) -> None:
@@ -244,7 +241,6 @@ class _Integration:
         self.states[: self._n_captured] = state
         direction = np.array([math.cos(state[4]), math.sin(state[4])])
         self.states[: self._n_captured, :2] += capture_s[: self._n_captured, None] * START_MPS * direction
-        self.switches = [(0.0, *self._acting)]
 
     @property
     def newest_capture(self) -> FloatArray:
@@ -265,7 +261,6 @@ class _Integration:
             self._t_s = until_s
             if self._pending and self._pending[0][0] <= self._t_s + 1e-12:
                 self._acting = self._pending.pop(0)[1]
-                self.switches.append((self._t_s, *self._acting))
 
     def _integrate_held(self, until_s: float) -> None:
         """Integrate with the acting inputs up to a time [s], and store the captures on the way."""

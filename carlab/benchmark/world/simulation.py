@@ -31,8 +31,6 @@ class Drive:
     capture_s (N s - s + 1,)   capture times [s]; row k was captured at index k s
     captures  (N s - s + 1, 6) true state there
     per_row   s, captures a row
-    switch_s  (W,)       times at which an acting command changes [s]
-    switch_values (W, 2) wheel angle [rad] and throttle that act from then on
     """
 
     row_s: FloatArray
@@ -40,8 +38,6 @@ class Drive:
     capture_s: FloatArray
     captures: FloatArray
     per_row: int
-    switch_s: FloatArray
-    switch_values: FloatArray
 
     @property
     def rows(self) -> FloatArray:
@@ -56,7 +52,6 @@ class _Acting:
         self.world = world
         self.rates = world.derivative()
         self.queues: tuple[deque[tuple[float, float]], ...] = (deque(), deque())
-        self.log: list[tuple[float, float, float]] = []
         self._act(0.0)
 
     def issue(self, t: float, command: tuple[float, float]) -> None:
@@ -88,7 +83,6 @@ class _Acting:
             self._act(t)
 
     def _act(self, t: float) -> None:
-        self.log.append((t, self.rates.angle, self.rates.throttle))
         for listener in self.world.switch_listeners:
             listener(t, self.rates.angle, self.rates.throttle)
 
@@ -149,10 +143,7 @@ def drive(
             commands[tick] = driver(next_tick, captures[max(captured - 1, 0)] if captured else state[:6])
             acting.issue(next_tick, (float(commands[tick, 0]), float(commands[tick, 1])))
             tick += 1
-    log = np.array(acting.log)
-    return Drive(
-        np.arange(count, dtype=np.float64) * period, commands, capture_s, captures, per_row, log[:, 0], log[:, 1:]
-    )
+    return Drive(np.arange(count, dtype=np.float64) * period, commands, capture_s, captures, per_row)
 
 
 def _before(state: FloatArray, t: float) -> FloatArray:
