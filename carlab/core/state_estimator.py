@@ -17,6 +17,7 @@ from carlab.core.angles import wrap
 from carlab.core.quantities import CarState, FloatArray, PoseSample
 
 MIN_SAMPLES = 3
+MAX_SPAN_WINDOWS = 4.0
 RESTART_AFTER_SAMPLES = 10
 
 
@@ -51,20 +52,16 @@ class StateEstimator:
 
     Args:
         window_s: Length of the window of the fit [s]. If it holds fewer than three samples (slow or lossy motion
-            capture), the three newest samples are used if they lie within ``max_span_s``.
-        max_span_s: Longest time span of a fit [s]; by default four windows.
+            capture), the three newest samples are used if they lie within four windows.
 
     Attributes:
         velocity_valid: False while there are too few samples; the velocities of ``estimate`` are zero then.
         dropped: Count of ignored samples: repeated, backward in time or not finite.
-        untracked: Count of ignored samples in which the body was not tracked.
     """
 
-    def __init__(self, window_s: float = 0.05, max_span_s: float | None = None) -> None:
+    def __init__(self, window_s: float = 0.05) -> None:
         self.window_s = window_s
-        self.max_span_s = 4.0 * window_s if max_span_s is None else max_span_s
         self.dropped = 0
-        self.untracked = 0
         self._poses: deque[tuple[float, float, float, float]] = deque()
         self._newest: PoseSample | None = None
         self._backward_run = 0
@@ -86,13 +83,12 @@ class StateEstimator:
         return self._newest
 
     def update(self, sample: PoseSample) -> None:
-        """Add one sample. Untracked, repeated, backward and non-finite samples are counted and ignored.
+        """Add one sample. Untracked samples are ignored; repeated, backward and non-finite ones are also counted.
 
         After a backward step of the source's clock (ten consecutive samples are older than the newest) the window
         restarts.
         """
         if not sample.tracked:
-            self.untracked += 1
             return
         pose = (sample.t_capture_s, sample.x_m, sample.y_m, sample.yaw_rad)
         if not all(map(math.isfinite, pose)):
@@ -134,6 +130,6 @@ class StateEstimator:
         newest_s = self._poses[-1][0]
         # Half a microsecond of tolerance keeps a sample that is exactly one window old despite rounding.
         while newest_s - self._poses[0][0] > self.window_s + 5e-7 and (
-            len(self._poses) > MIN_SAMPLES or newest_s - self._poses[0][0] > self.max_span_s
+            len(self._poses) > MIN_SAMPLES or newest_s - self._poses[0][0] > MAX_SPAN_WINDOWS * self.window_s
         ):
             self._poses.popleft()

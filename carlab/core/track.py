@@ -25,6 +25,7 @@ MAX_CLOSING_RATIO = 5.0
 """Maximum distance from the last point to the first, over that of other neighbours; a longer one is a missing part."""
 COLUMNS = ("x", "y", "width")
 _AMBIGUITY_COST_M = 1e3
+_REACH_M = 0.5
 
 
 class Projection(NamedTuple):
@@ -47,14 +48,12 @@ class ClosedPath:
         """Length of the closed path [m]."""
         return float(_segments(self)[2].sum())
 
-    def project(self, positions_m: Any, near_m: Any | None = None, reach_m: float = 0.5) -> Projection:
+    def project(self, positions_m: Any, near_m: Any | None = None) -> Projection:
         """Project positions (..., 2), NumPy or torch, on the path.
 
         Args:
             positions_m: the positions (..., 2).
-            near_m: arc lengths (...,) that restrict the search to within ``reach_m``, so that crossings are
-                unambiguous.
-            reach_m: the half-width of that restriction.
+            near_m: arc lengths (...,) that restrict the search to within 0.5 m, so that crossings are unambiguous.
         """
         xp = array_namespace(positions_m)
 
@@ -71,18 +70,18 @@ class ClosedPath:
         cost = distance
         if near_m is not None:
             apart = xp.abs(wrap_length(arc - near_m[..., None], self.length_m))
-            cost = distance + _AMBIGUITY_COST_M * xp.astype(apart > reach_m, positions_m.dtype)
+            cost = distance + _AMBIGUITY_COST_M * xp.astype(apart > _REACH_M, positions_m.dtype)
         index = xp.argmin(cost, axis=-1)[..., None]
         return Projection(
             *(xp.take_along_axis(v, index, axis=-1)[..., 0] for v in (arc, distance, value + slope * along))
         )
 
-    def travelled_m(self, positions_m: FloatArray, reach_m: float = 0.5) -> FloatArray:
+    def travelled_m(self, positions_m: FloatArray) -> FloatArray:
         """Distance along the path (T,) of consecutive positions (T, 2), from the first point; several laps add up."""
         travelled = np.empty(len(positions_m))
         for k, position in enumerate(positions_m):
             near = None if k == 0 else np.asarray(travelled[k - 1] % self.length_m)
-            arc = float(self.project(position, near, reach_m).arc_m)
+            arc = float(self.project(position, near).arc_m)
             before = 0.0 if k == 0 else travelled[k - 1]
             travelled[k] = before + wrap_length(arc - before, self.length_m)
         return travelled
