@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 
-def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share (Wilson, 1927). (0, 1) without cases."""
     if count == 0:
         return 0.0, 1.0
+    z = 1.96
     share, squared = hits / count, z * z
     middle = (share + squared / (2 * count)) / (1 + squared / count)
     half = z / (1 + squared / count) * math.sqrt(share * (1 - share) / count + squared / (4 * count * count))

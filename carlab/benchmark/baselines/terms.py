@@ -175,11 +175,11 @@ def _by_sides(car: BaseCar, front: FloatArray, rear: FloatArray, d: FloatArray) 
     return np.stack([-front * np.sin(d) / car.mass, across, moment / car.yaw_inertia], axis=1)
 
 
-def _relaxation(s: Steps, length: float = 0.05) -> FloatArray:
-    """Tyre relaxation: F = F_steady - (length / vx) dF_steady/dt."""
+def _relaxation(s: Steps) -> FloatArray:
+    """Tyre relaxation over 0.05 m: F = F_steady - (length / vx) dF_steady/dt."""
     angles = s.car.max_angle * s.commands()[:, :, 0]
     begin, end = _sides(s.car, s.starts, angles[:, 0]), _sides(s.car, s.ends, angles[:, -1])
-    late = length / np.maximum(np.abs(s.middle[:, 3]), 0.3) / s.length_s
+    late = 0.05 / np.maximum(np.abs(s.middle[:, 3]), 0.3) / s.length_s
     front, rear = (-late * (b - a) for a, b in zip(begin, end, strict=True))
     d = angles.mean(axis=1)
     return _by_sides(s.car, front, rear, d)

@@ -80,10 +80,9 @@ def random_physics(rng: np.random.Generator, count: int, first_seed: int) -> lis
     ]
 
 
-def short_set(
-    purpose: Purpose, seed: int = 0, effects: tuple[str, ...] = ("steering_lag", "rolling_resistance")
-) -> list[CaseSpec]:
+def short_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
     """A few short cases of each kind."""
+    effects = ("steering_lag", "rolling_resistance")
     specs = _specs(purpose, seed, per_effect=1, nulls=2, pairs=0, outside=1, per_fault=0, effects=effects)
     return [replace(spec, fit_s=40.0, hold_s=20.0) for spec in specs]
 

@@ -40,6 +40,7 @@ SCALE = 0.1
 MAX_ANGLE_RAD = 0.5
 FULL_THROTTLE_MPS2 = 6.0
 START_MPS = 1.0
+COMMAND_DELAY_S = 0.05  # from a command to the inputs of the package
 ROLLING_MPS = 0.7  # below 0.1 m/s the package has no tyre and wheel dynamics
 DRIVER_GRIP = 0.75  # share of the tyres' grip that the driver uses; beyond it inner wheels lift, which is not modelled
 RTOL = 1e-6
@@ -87,10 +88,9 @@ class PublicCar:
 
     Args:
         model: Model of the package.
-        command_delay_s: Delay from a command to the inputs of the package [s].
     """
 
-    def __init__(self, model: Model, command_delay_s: float = 0.05) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         self.p = parameters()
         if model == "multi_body":
@@ -104,7 +104,7 @@ class PublicCar:
         # Used by the driver only.
         self.car = BaseCar(
             mass=p.m, yaw_inertia=p.I_z, front_axle=p.a, rear_axle=p.b, mu_front=grip, mu_rear=grip,
-            drive_gain=FULL_THROTTLE_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
+            drive_gain=FULL_THROTTLE_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=COMMAND_DELAY_S,
         )  # fmt: skip
 
     def start(self, x: float, y: float, yaw: float, speed: float) -> FloatArray:
