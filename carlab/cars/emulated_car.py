@@ -128,7 +128,6 @@ class EmulatedCar(Car):
         actuator: ``serial`` or ``can``.
         seed: seed of the motion capture's noise.
         reality: physics and motion capture of the world if they differ from the file's; the driver knows the file only.
-        world: further options of the world (bitstream, multicast ...).
         actuator_options: further options of the actuator (rates, watchdog ...).
     """
 
@@ -141,7 +140,6 @@ class EmulatedCar(Car):
         actuator: str = "serial",
         seed: int = 0,
         reality: SimulatorConfig | None = None,
-        world: Mapping[str, Any] | None = None,
         actuator_options: Mapping[str, Any] | None = None,
     ) -> None:
         self.name = f"{file.name} ({actuator})"
@@ -150,7 +148,7 @@ class EmulatedCar(Car):
         self._actuator = actuator
         self._actuator_options = dict(actuator_options or {})
         physics = (reality or file.simulator).to_tables()
-        self._config = WorldConfig(simulator=physics, actuator=actuator, seed=seed, **(world or {}))
+        self._config = WorldConfig(simulator=physics, actuator=actuator, seed=seed)
         self._world: EmulatedWorld | None = None
         self._car: HardwareCar | None = None
 

@@ -16,6 +16,8 @@ COMMAND_TO_WIRE = "command to wire"
 WIRE_TO_FIRMWARE = "wire to firmware"
 EXPOSURE_TO_ARRIVAL = "exposure to arrival"
 ARRIVAL_TO_LOOP = "arrival to loop"
+TICKS = 90
+"""Number of commands whose latency is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,7 @@ def measure_pose_latency(car: Car, *, seconds: float = 2.0, period_s: float = 1.
     return LatencyParts({name: samples for name, samples in found.items() if samples.size})
 
 
-def measure_latency(car: EmulatedCar, *, ticks: int = 90, period_s: float = 1.0 / 30.0) -> LatencyParts:
+def measure_latency(car: EmulatedCar, *, period_s: float = 1.0 / 30.0) -> LatencyParts:
     """Measure every part on an open emulated car by steering at rest with a different value each tick.
 
     The sender reports when a command was written, the emulated firmware when it was decoded; the servo position
@@ -63,7 +65,7 @@ def measure_latency(car: EmulatedCar, *, ticks: int = 90, period_s: float = 1.0 
     written: dict[int, float] = {}
     pacer = Pacer(car.clock, period_s)
     start_s = pacer.start()
-    for k in range(ticks):
+    for k in range(TICKS):
         steering = (k + 1) / (1000.0 * calibration.servo_range_left)
         key = calibration.to_device(Action(steering)).servo_steps
         issued[key] = car.clock.now_s()
