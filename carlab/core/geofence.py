@@ -42,19 +42,22 @@ def contains(corners_m: Polygon, x_m: Any, y_m: Any) -> Any:
     return inside
 
 
-def free_distances_m(corners_m: Polygon, places_m: FloatArray, heading_rad: FloatArray) -> FloatArray:
-    """Distances (n,) [m] from points (n, 2) along headings (n,) to the polygon's nearest edge; inf without an edge."""
-    corners = np.asarray(corners_m, dtype=np.float64)
-    before = np.roll(corners, 1, axis=0)
-    edge = corners - before
-    to = before - places_m[:, None]  # (n, edges, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        direction = np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=1)[:, None]
-        cross = _cross(direction, edge)
-        along, on_edge = _cross(to, edge) / cross, _cross(to, direction) / cross
-    met = (np.abs(cross) > 1e-12) & (along >= 0.0) & (on_edge >= -1e-9) & (on_edge <= 1.0 + 1e-9)
-    distances: FloatArray = np.where(met, along, np.inf).min(axis=1)
-    return distances
+def free_distance_m(corners_m: Polygon, x_m: float, y_m: float, heading_rad: float) -> float:
+    """Distance [m] from a point along a heading to the polygon's nearest edge; inf if the ray meets none."""
+    direction_x, direction_y = math.cos(heading_rad), math.sin(heading_rad)
+    nearest = math.inf
+    previous_x, previous_y = corners_m[-1]
+    for corner_x, corner_y in corners_m:
+        edge_x, edge_y = corner_x - previous_x, corner_y - previous_y
+        to_x, to_y = previous_x - x_m, previous_y - y_m
+        cross = direction_x * edge_y - direction_y * edge_x
+        if abs(cross) > 1e-12:
+            along = (to_x * edge_y - to_y * edge_x) / cross
+            on_edge = (to_x * direction_y - to_y * direction_x) / cross
+            if along >= 0.0 and -1e-9 <= on_edge <= 1.0 + 1e-9:
+                nearest = min(nearest, along)
+        previous_x, previous_y = corner_x, corner_y
+    return nearest
 
 
 def stopping_distance_m(speed_mps: Any, reaction_s: float, deceleration_mps2: float) -> Any:
@@ -64,10 +67,13 @@ def stopping_distance_m(speed_mps: Any, reaction_s: float, deceleration_mps2: fl
 
 def can_stop_inside(corners_m: Polygon, state: CarState, reaction_s: float, deceleration_mps2: float) -> bool:
     """Whether the car and its stopping point, straight along its course over ground, are inside."""
+    if not contains(corners_m, state.x_m, state.y_m):
+        return False
+    speed = state.speed_mps
     course_rad = state.yaw_rad + math.atan2(state.vy_mps, state.vx_mps)
-    needed_m = stopping_distance_m(state.speed_mps, reaction_s, deceleration_mps2)
-    places_m = np.array([[state.x_m, state.y_m]])
-    return bool(can_stop_inside_batch(corners_m, places_m, np.array([course_rad]), np.array([needed_m]))[0])
+    needed = stopping_distance_m(speed, reaction_s, deceleration_mps2)
+    # From inside, every ray meets an edge: infinity means a NaN course or a point on an edge.
+    return bool(needed < free_distance_m(corners_m, state.x_m, state.y_m, course_rad) < math.inf)
 
 
 def can_stop_inside_batch(
@@ -84,9 +90,17 @@ def can_stop_inside_batch(
     Returns:
         Whether each car can stop inside (n,).
     """
-    free_m = free_distances_m(corners_m, places_m, course_rad)
-    # From inside, every ray meets an edge: infinity means a NaN course or a point on an edge.
-    found: NDArray[np.bool_] = contains(corners_m, *places_m.T) & (needed_m < free_m) & (free_m < np.inf)
+    corners = corners_array(corners_m)
+    before = np.roll(corners, 1, axis=0)
+    edge = corners - before
+    to = before - places_m[:, None]  # (n, edges, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        direction = np.stack([np.cos(course_rad), np.sin(course_rad)], axis=1)[:, None]
+        cross = _cross(direction, edge)
+        along, on_edge = _cross(to, edge) / cross, _cross(to, direction) / cross
+    met = (np.abs(cross) > 1e-12) & (along >= 0.0) & (on_edge >= -1e-9) & (on_edge <= 1.0 + 1e-9)
+    free = np.where(met, along, np.inf).min(axis=1)
+    found: NDArray[np.bool_] = contains(corners_m, *places_m.T) & (needed_m < free) & (free < np.inf)
     return found
 
 
@@ -98,3 +112,8 @@ def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
 def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) -> tuple[tuple[float, float], ...]:
     """Corners of a rectangle, counter-clockwise."""
     return ((x_low_m, y_low_m), (x_high_m, y_low_m), (x_high_m, y_high_m), (x_low_m, y_high_m))
+
+
+def corners_array(corners_m: Polygon) -> FloatArray:
+    """Corners as an array (n, 2) [m]."""
+    return np.asarray(corners_m, dtype=np.float64).reshape(-1, 2)

@@ -12,7 +12,7 @@ from carlab.core.geofence import (
     can_stop_inside,
     can_stop_inside_batch,
     contains,
-    free_distances_m,
+    free_distance_m,
     rectangle,
     stopping_distance_m,
 )
@@ -33,15 +33,14 @@ def test_contains_agrees_with_matplotlib(rng: np.random.Generator) -> None:
     [(0.0, 2.0), (math.pi, 2.0), (math.pi / 2, 0.5), (-math.pi / 2, 0.5), (-math.atan2(0.5, 2.0), math.hypot(0.5, 2))],
 )
 def test_free_distance_inside_a_concave_polygon(heading_rad: float, distance_m: float) -> None:
-    found = free_distances_m(CONCAVE, np.array([[2.0, 0.5]]), np.array([heading_rad]))
-    assert found == pytest.approx(distance_m)
+    assert free_distance_m(CONCAVE, 2.0, 0.5, heading_rad) == pytest.approx(distance_m)
 
 
 def test_free_distance_ends_at_the_nearest_edge_in_either_sense() -> None:
     # From the left arm of the W towards the right arm the ray leaves through the notch and enters again.
     for corners in (CONCAVE, CONCAVE[::-1]):
-        found = free_distances_m(corners, np.array([[0.5, 2.0], [3.5, 2.0]]), np.array([0.0, math.pi]))
-        assert found == pytest.approx(0.5)
+        assert free_distance_m(corners, 0.5, 2.0, 0.0) == pytest.approx(0.5)
+        assert free_distance_m(corners, 3.5, 2.0, math.pi) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
