@@ -143,7 +143,7 @@ def diagnose(
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, workers or FunctionWorkers())
     recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
-    scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
+    scored, naming = _search_effects(recordings, noise, request, control, timer)
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
     return _with_run(outcome, timer, effects or (), decisions)
 
@@ -197,9 +197,10 @@ def _estimate_noise(
 
 
 def _search_effects(
-    recordings: SplitRecordings, noise: Noise, request: Request, control: RunControl
+    recordings: SplitRecordings, noise: Noise, request: Request, control: RunControl, timer: SearchTimer
 ) -> tuple[ScoredSearch, NamingResult]:
     """Search for effects, withdraw spurious ones, and score the result on held-out windows."""
+    control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, request.nominal
     identification = request.settings.identification
     floor: FloatArray = np.sqrt(np.mean(noise_floor(windows, noise, nominal, identification)[1:] ** 2, axis=0))
@@ -228,6 +229,7 @@ def _search_effects(
         scored = without_uncertain_effects(scored, search_control)
         if scored.found.effects != naming.found.effects:
             naming = with_fewer_effects(problem, naming, scored.found, search_control)
+    timer.end_checks()
     return scored, naming
 
 

@@ -50,6 +50,11 @@ class SearchTimer:
                 self._stopped_by = "budget"
         return bool(self._stopped_by)
 
+    def end_checks(self) -> None:
+        """Remember that the user ended the checks after the search, which then skip the rest of their fits."""
+        if not self._stopped_by and self._stop():
+            self._stopped_by = "user"
+
     def omit(self, stage: str) -> None:
         """Remember that the user ended a requested stage without a result."""
         self._omitted.append(stage)

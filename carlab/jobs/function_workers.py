@@ -81,7 +81,7 @@ class FunctionWorkers:
         threads = self._start_sharing(function, arguments, pending, results)
         try:
             while pending or any(thread.is_alive() for thread in threads):
-                if stop():
+                if pending and stop():
                     pending.clear()
                 index = _next(pending)
                 if index is None:  # all calls have begun; one that fails in a child becomes pending again

@@ -24,11 +24,15 @@ from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.forward import Path as SelectionPath
 from carlab.diagnosis.selection.forward import extend
-from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
+from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
 from carlab.jobs.function_workers import FunctionWorkers
+from carlab.prediction.windows import cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
+from sim_backends import SimulatorConfig
 from sim_backends.effects import CATALOGUE, confusable_effects
+from tests.helpers.recorded_drives import PERIOD_S, drive
 
 Table = dict[str, np.ndarray]
 TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
@@ -185,6 +189,56 @@ def test_stopped_search_keeps_the_effects_found_so_far(drag: Case, tmp_path: Pat
     assert outcome.diagnosis.search == SearchExtent(False, "user", None)
 
 
+def one_step(problem: SearchProblem, start: SelectionPath, control: RunControl) -> SelectionPath:
+    """A greedy path that ends after its first effect."""
+    one = replace(problem.settings, selection=replace(problem.settings.selection, max_effects=1))
+    return extend(replace(problem, settings=one), start, control)
+
+
+def test_search_that_is_stopped_during_its_alternatives_is_incomplete(
+    strong_drag: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    activities: list[str] = []
+    results: list[SearchResult] = []
+
+    def recorded_search(problem: SearchProblem, control: RunControl) -> SearchResult:
+        results.append(search(problem, control))
+        return results[-1]
+
+    monkeypatch.setattr("carlab.diagnosis.selection.search.extend", one_step)
+    monkeypatch.setattr("carlab.diagnosis.diagnose.search", recorded_search)
+    settings = replace(FEWER, selection=replace(DEFAULT.selection, min_effects_for_alternatives=1))
+    outcome = found(
+        strong_drag,
+        tmp_path,
+        (0.02, 0.02),
+        settings,
+        progress=lambda activity, share: activities.append(activity),
+        stop=lambda: any(activity.startswith("alternative 1") for activity in activities),
+    )
+    assert outcome.diagnosis.search == SearchExtent(False, "user", None)
+    assert not results[0].is_complete
+
+
+def test_search_without_further_candidates_is_complete_after_its_time_limit() -> None:
+    car = SimulatorConfig(control_period_s=PERIOD_S)
+    windows = cut_windows(segments_of([drive(car, 15.0, 3)]), 0.8, 0.5)
+    problem = SearchProblem(car, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ())
+    polls = iter([False])  # the time ends after the first poll
+    assert search(problem, RunControl(ends_search=lambda: next(polls, True))).is_complete
+
+
+def test_stop_during_the_checks_after_the_search_is_reported() -> None:
+    stopped: list[bool] = []
+    timer = SearchTimer(None, stop=lambda: bool(stopped))
+    assert not timer.ends_search()
+    timer.end_checks()
+    assert timer.extent().is_complete
+    stopped.append(True)
+    timer.end_checks()
+    assert timer.extent() == SearchExtent(False, "user", None)
+
+
 @pytest.mark.parametrize(
     ("case", "limits", "expected"),
     [
@@ -203,11 +257,6 @@ def test_other_choice_repairs_a_wrong_turn(
     expected: set[str],
 ) -> None:
     """A greedy path that ends after its first effect leaves the drag, unless other choices are followed."""
-
-    def one_step(problem: SearchProblem, start: SelectionPath, control: RunControl) -> SelectionPath:
-        one = replace(problem.settings, selection=replace(problem.settings.selection, max_effects=1))
-        return extend(replace(problem, settings=one), start, control)
-
     monkeypatch.setattr("carlab.diagnosis.selection.search.extend", one_step)
     selection = replace(DEFAULT.selection, **{"min_effects_for_alternatives": 1, **limits})
     settings = replace(FEWER, selection=selection)

@@ -18,8 +18,8 @@ def search_sentences(search: SearchExtent) -> str:
         )
     elif not search.is_complete:
         text += (
-            " The search for effects was stopped by the user, so it may have missed some. Diagnose again for a "
-            "complete search."
+            " The user stopped the search for effects or the checks after it, so effects may be missing, and named "
+            "ones may be wrong. Diagnose again for a complete search."
         )
     if search.omitted:
         text += f" The user ended the diagnosis, so this report has no {listed(search.omitted, 'and no')}."

@@ -60,7 +60,7 @@ def extend(
         candidates = next_candidates(problem, path.model, control)
         path = path if path.history else replace(path, first_candidates=candidates)
         chosen = accepted(problem, path.model, candidates, control)
-        if control.ends_search() or not chosen:
+        if not chosen or control.ends_search():
             break
         before = frozenset(path.model.effects)
         path = _add(problem, path, chosen, control)
@@ -79,7 +79,7 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
     best_first = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.left_out_gain)
     choices = best_first[: settings.max_alternatives]
     for k, choice in enumerate(choices):
-        if control.ends_search() or remaining_excess(problem, base, best.model) < settings.min_remaining_excess:
+        if remaining_excess(problem, base, best.model) < settings.min_remaining_excess or control.ends_search():
             break
         names = (*choice.path.model.effects, choice.candidate.effect)
         log.info("alternative %d of %d: %s", k + 1, len(choices), ", ".join(names))

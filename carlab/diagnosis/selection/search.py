@@ -20,11 +20,18 @@ from carlab.diagnosis.selection.shared_delays import replace_shared_delays
 
 def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     """Add effects until none is accepted."""
+    is_cut_short = False
+
+    def ends_search() -> bool:
+        nonlocal is_cut_short
+        is_cut_short = is_cut_short or control.ends_search()
+        return is_cut_short
+
+    limited = replace(control, ends_search=ends_search)
     control.progress("refit of the base parameters", 0.0)
     base = fit_base(problem)
-    greedy = extend(problem, Path(base), control)
-    is_complete = not control.ends_search()
-    path = best_path(problem, base, greedy, control)
+    greedy = extend(problem, Path(base), limited)
+    path = best_path(problem, base, greedy, limited)
     eliminated = eliminate(problem, path.model, control)
     eliminated = replace_shared_delays(problem, eliminated, control)
     model, pairs = choose_confusable(problem, eliminated, control)
@@ -38,7 +45,7 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
         path.history,
         greedy.first_candidates,
         model.scale,
-        is_complete,
+        not is_cut_short,
     )
 
 
