@@ -22,7 +22,7 @@ from carlab.diagnosis.evidence import (
     unexplained_share,
     verdict_of,
 )
-from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, FigureData, FitErrors, RecordingUse
+from carlab.diagnosis.findings import Ceiling, CurveTrial, DataFault, Diagnosis, FigureData, FitErrors, RecordingUse
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -247,7 +247,7 @@ def _assemble_result(
         error = scored.errors["with_effects"]
         unexplained, model = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
-    measured = _measured_curves(scored, share, recordings, request, control)
+    measured, curve_trial = _measured_curves(scored, share, recordings, request, control)
     adaptation = _adaptation(scored, measured, recordings, request, control)
     models = _models(scored, measured, adaptation, recordings, request, control)
     model = model if measured is None else measured.fit.config
@@ -269,6 +269,7 @@ def _assemble_result(
         seed=request.seed,
         seconds=0.0,
         curves=() if measured is None else curve_findings(measured, request.nominal, segments, settings),
+        curve_trial=curve_trial,
         ceiling=_ceiling(held_out_errors),
         skill=skill_of(
             held_out.windows,
@@ -300,17 +301,20 @@ def _errors_with_events(
 
 def _measured_curves(
     scored: ScoredSearch, unexplained: float, recordings: SplitRecordings, request: Request, control: RunControl
-) -> CurveFit | None:
+) -> tuple[CurveFit | None, CurveTrial | None]:
     """Measured curves if they are wanted, and named effects leave a residual that a curve may explain."""
     settings = request.settings.curves
-    if not request.curves or unexplained < settings.min_unexplained_share:
-        return None
-    found = None if control.stop() else fit_curves(scored.problem, scored.found, control)
-    if found is None:
-        if control.stop():
-            control.omit("measured curves")
-        return None
-    return without_extrapolation(found, recordings.fit_segments, settings)
+    if not request.curves:
+        return None, None
+    if unexplained < settings.min_unexplained_share:
+        return None, CurveTrial(is_fitted=False)
+    found, rejected = (None, ()) if control.stop() else fit_curves(scored.problem, scored.found, control)
+    if found is not None:
+        return without_extrapolation(found, recordings.fit_segments, settings), CurveTrial(True, rejected)
+    if control.stop():
+        control.omit("measured curves")
+        return None, None
+    return None, CurveTrial(True, rejected)
 
 
 def _models(

@@ -15,8 +15,10 @@ from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.events import Event, EventUse
 from carlab.diagnosis.measured import CurveAxis as CurveAxis
 from carlab.diagnosis.measured import CurveFinding as CurveFinding
+from carlab.diagnosis.measured import CurveTrial as CurveTrial
 from carlab.diagnosis.measured import Estimate as Estimate
 from carlab.diagnosis.measured import FormFinding as FormFinding
+from carlab.diagnosis.measured import RejectedCurves as RejectedCurves
 from carlab.diagnosis.measured import curve_table
 from carlab.diagnosis.settings import DEFAULT
 
@@ -253,7 +255,8 @@ class Diagnosis:
 
     ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; with measured curves also
     with_curves, with a ceiling also black_box, with a discrepancy also with_discrepancy. ``held_out_with_events`` has
-    the same models, scored with the windows that events left out; empty without such windows.
+    the same models, scored with the windows that events left out; empty without such windows. ``curve_trial`` is None
+    without measured curves as a stage, and if the user ended it.
     """
 
     verdict: Verdict
@@ -269,6 +272,7 @@ class Diagnosis:
     seconds: float
     advice: str = ""
     curves: tuple[CurveFinding, ...] = ()
+    curve_trial: CurveTrial | None = None
     ceiling: Ceiling | None = None
     skill: tuple[Skill, ...] = ()
     drift: tuple[Drift, ...] = ()
@@ -301,6 +305,7 @@ class Diagnosis:
             "fit": {"horizon_s": self.horizon_s, "held_out": {k: asdict(v) for k, v in self.held_out.items()}},
             "unexplained": unexplained,
             "curves": [curve_table(curve) for curve in self.curves],
+            "curve_trial": None if self.curve_trial is None else asdict(self.curve_trial),
             "ceiling": None if self.ceiling is None else asdict(self.ceiling),
             "skill": [asdict(s) for s in self.skill],
             "drift": [_drift_table(d) for d in self.drift],

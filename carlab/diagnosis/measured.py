@@ -26,6 +26,34 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
+class RejectedCurves:
+    """Measured curves that were fitted and not accepted.
+
+    Attributes:
+        curves: ids of the curves that were tested together.
+        standard_errors: fall of the loss on left-out blocks with them, in standard errors.
+        min_standard_errors: fall that is required, in standard errors.
+    """
+
+    curves: tuple[str, ...]
+    standard_errors: float
+    min_standard_errors: float
+
+
+@dataclass(frozen=True, slots=True)
+class CurveTrial:
+    """What the fit of measured curves did in addition to the accepted curves.
+
+    Attributes:
+        is_fitted: false if the model leaves too small a share of the excess for curves.
+        rejected: curves that were fitted and not accepted.
+    """
+
+    is_fitted: bool
+    rejected: tuple[RejectedCurves, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class CurveAxis:
     """An input of a measured curve with its knots in ``unit``."""
 

@@ -282,7 +282,6 @@ class _SideForceMap(MeasuredCurve, DynamicsEffect):
     axle: ClassVar[str]
     order = 5
     base_models = ("dynamic", "linear_tyre", "blend")
-    quantity = "side force per axle load"
     unit, typical, bound = "1", 0.1, 3.0
 
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
@@ -316,6 +315,7 @@ class FrontTyreMap(_SideForceMap):
 
     id = "front_tyre_map"
     axle = "front"
+    quantity = "side force of the front axle per load"
     summary = "The front side force is a measured map over longitudinal force and slip angle."
     class_statement = "a map of the front side force over longitudinal force and slip angle"
     axes = (Axis(_FORCE_NAME, _FORCE_UNIT, (-6.0, -3.0, 0.0, 3.0, 6.0)), _SLIP_AXIS)
@@ -337,6 +337,7 @@ class RearTyreMap(_SideForceMap):
 
     id = "rear_tyre_map"
     axle = "rear"
+    quantity = "side force of the rear axle per load"
     summary = "The rear side force is a measured map over longitudinal force and slip angle."
     class_statement = "a map of the rear side force over longitudinal force and slip angle"
     axes = (Axis(_FORCE_NAME, _FORCE_UNIT, (-8.0, -5.0, -2.5, 0.0, 2.5, 5.0, 8.0)), _SLIP_AXIS)

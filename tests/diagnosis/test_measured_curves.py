@@ -9,22 +9,26 @@ import numpy as np
 import pytest
 
 from carlab.cars import load_car_file
+from carlab.diagnosis.curves.curve_fit import fit_curves
 from carlab.diagnosis.curves.simulator_with_curves import simulator_with_curves
 from carlab.diagnosis.curves.support import curve_findings, driving_time_s
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.evidence import Texts
-from carlab.diagnosis.findings import CurveAxis, CurveFinding
+from carlab.diagnosis.findings import CurveAxis, CurveFinding, CurveTrial, FigureData, RejectedCurves
 from carlab.diagnosis.identification.fit import Fitter, Scale
 from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
+from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, with_unit
 from carlab.diagnosis.report.write import write_report
-from carlab.diagnosis.selection.problem import SearchProblem
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, CurveSettings
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
 from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter, confusable_effects
+from tests.diagnosis.report_material import no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
@@ -187,6 +191,47 @@ def test_readings_of_the_car_file_itself_are_empty(outcome):
     held = [s for s in readings_of_drive(same, DEFAULT.report) if "brakes" in s or "saturates" in s]
     assert held == []
     assert curve_sentences(replace(outcome.diagnosis, curves=())) == []
+
+
+def test_curve_that_the_recordings_do_not_need_is_rejected_with_its_test():
+    """The drive is that of the car file, so no curve improves the prediction."""
+    windows = cut_windows(segments_of([drive(CAR, 20.0, 5)]), 0.8, 0.8)
+    problem = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, (), SETTINGS)
+    found = search(problem, RunControl())
+    with only_curve("steering_curve"):
+        accepted, rejected = fit_curves(problem, found, RunControl())
+    assert accepted is None
+    assert [each.curves for each in rejected] == [("steering_curve",)]
+    assert rejected[0].standard_errors < rejected[0].min_standard_errors
+
+
+@pytest.mark.parametrize(
+    ("trial", "expected"),
+    [
+        (
+            CurveTrial(True, (RejectedCurves(("steering_curve",), -0.8, 0.0),)),
+            "The measured curve of the wheel angle is fitted but not accepted: it raises the loss on left-out blocks "
+            "by 0.8 standard errors.",
+        ),
+        (
+            CurveTrial(True, (RejectedCurves(("drive_map", "front_tyre_map"), 1.94, 3.0),)),
+            "The measured curves of the acceleration by the motor and side force of the front axle per load are fitted "
+            "but not accepted: together they lower the loss on left-out blocks by 1.94 standard errors, less than the "
+            "required 3.",
+        ),
+        (
+            CurveTrial(is_fitted=False),
+            "Measured curves are not fitted: the model leaves less than 10 % of the refit's squared excess over the "
+            "noise floor.",
+        ),
+    ],
+)
+def test_report_states_why_curves_are_not_accepted(trial, expected):
+    without = replace(no_mismatch(), sentence="", curve_trial=trial)
+    assert curve_sentences(without) == [expected]
+    page = render_page(without, FigureData())
+    assert expected.replace("'", "&#39;") in page
+    assert without.to_dict()["curve_trial"]["is_fitted"] == trial.is_fitted
 
 
 @pytest.mark.parametrize("curve", CURVES, ids=lambda c: c.id)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.findings import RejectedCurves
 from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.prediction.errors import prediction_errors
@@ -34,10 +35,15 @@ class CurveFit:
     standard_errors: float
 
 
-def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl) -> CurveFit | None:
-    """Fit all applicable curves, remove those that left-out blocks do not need; None if none remains.
+def fit_curves(
+    problem: SearchProblem, found: SearchResult, control: RunControl
+) -> tuple[CurveFit | None, tuple[RejectedCurves, ...]]:
+    """Fit all applicable curves, and remove those that left-out blocks do not need.
 
     Named effects that a curve contains are omitted. The fit begins on fewer windows, to save time.
+
+    Returns:
+        The fit with the accepted curves, or None without any, and the rejected curves.
     """
     curves = tuple(c.id for c in CURVES if is_applicable(problem.nominal, c.id) and c.id not in problem.nominal.effects)
     effects = _effects_with(problem, found, curves)
@@ -45,9 +51,9 @@ def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl)
     few = replace(problem, windows=problem.windows.thinned(settings.max_windows))
     control.progress("fitting measured curves", 0.0)
     fit = _fit(few, (*effects, *curves), _coordinates(found.best), settings.first_iterations, settings.last_iterations)
-    fit, curves = _eliminate(few, fit, effects, curves, control)
+    fit, curves, rejected = _eliminate(few, fit, effects, curves, control)
     if not curves or control.stop():
-        return None
+        return None, rejected
     control.progress("fitting measured curves to all windows", 0.6)
     effects = _effects_with(problem, found, curves)
     fit = _fit(problem, (*effects, *curves), _coordinates(fit), settings.iterations, settings.last_iterations)
@@ -58,9 +64,9 @@ def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl)
     gain, error = clustered_gain(losses[0], losses[1], problem.windows)
     log.info("measured curves %s: gain on left-out blocks %.1f standard errors", ", ".join(curves), gain / error)
     if gain < settings.accept_z_min * error:
-        return None
+        return None, (*rejected, RejectedCurves(curves, gain / error, settings.accept_z_min))
     fit = problem.fitter(scale).with_covariance(fit)
-    return CurveFit(curves, effects, fit, gain / error)
+    return CurveFit(curves, effects, fit, gain / error), rejected
 
 
 def _effects_with(problem: SearchProblem, found: SearchResult, curves: tuple[str, ...]) -> tuple[str, ...]:
@@ -91,11 +97,16 @@ def _fit(problem: SearchProblem, effects: tuple[str, ...], start: dict[str, floa
 
 def _eliminate(
     problem: SearchProblem, fit: Fit, effects: tuple[str, ...], curves: tuple[str, ...], control: RunControl
-) -> tuple[Fit, tuple[str, ...]]:
-    """Remove each curve, the last one first, if the loss on left-out blocks does not rise without it."""
+) -> tuple[Fit, tuple[str, ...], tuple[RejectedCurves, ...]]:
+    """Remove each curve, the last one first, if the loss on left-out blocks does not rise without it.
+
+    Returns:
+        The fit with the remaining curves, these curves, and the removed ones.
+    """
     settings = problem.settings.curves
     scale = _scale(problem, fit.config)
     loss = _left_out_loss(problem, fit, scale)
+    rejected: list[RejectedCurves] = []
     for k, name in enumerate(reversed(curves)):
         if control.stop():
             break
@@ -107,7 +118,8 @@ def _eliminate(
         log.info("without %s: the loss on left-out blocks rises by %.1f standard errors", name, rise / error)
         if rise < settings.keep_z_min * error:
             fit, curves, loss = without, kept, loss_without
-    return fit, curves
+            rejected.append(RejectedCurves((name,), rise / error, settings.keep_z_min))
+    return fit, curves, tuple(rejected)
 
 
 def _left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:

@@ -57,7 +57,7 @@ def simulator_with_curves(
     problem = SearchProblem(nominal, windows, floor, noise.measured, {}, EFFECTS_WITH_CURVES, settings)
     control = RunControl()
     found = search(problem, control)
-    measured = fit_curves(problem, found, control)
+    measured, _ = fit_curves(problem, found, control)
     if measured is None:
         return found.best.config
     return without_extrapolation(measured, recordings.fit_segments, settings.curves).fit.config

@@ -7,25 +7,65 @@ import itertools
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.findings import CurveFinding, Diagnosis
+from carlab.diagnosis.findings import CurveFinding, Diagnosis, RejectedCurves
 from carlab.diagnosis.report.figures import Figure
 from carlab.diagnosis.report.sentences import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.svg import Chart, padded
 from carlab.diagnosis.settings import DEFAULT, ReportSettings
+from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.effects.curves import DriveMap
 
 MAX_PANELS = 9
 
 
 def curve_sentences(diagnosis: Diagnosis) -> list[str]:
-    """Sentences of each measured curve: its largest difference from the car file, its form, readings of the drive."""
+    """Sentences of each measured curve: its largest difference from the car file, its form, readings of the drive.
+
+    Sentences of curves that are not accepted, or not fitted, come last.
+    """
     made = []
     for curve in diagnosis.curves:
         made.append(_largest_difference(curve))
         made.append(form_sentence(curve))
         if curve.id == DriveMap.id:
             made += readings_of_drive(curve, DEFAULT.report)
-    return [sentence for sentence in made if sentence]
+    return [sentence for sentence in (*made, *_trial_sentences(diagnosis)) if sentence]
+
+
+def _trial_sentences(diagnosis: Diagnosis) -> list[str]:
+    """Why measured curves are not accepted, or not fitted; empty without this stage."""
+    trial = diagnosis.curve_trial
+    if trial is None:
+        return []
+    if not trial.is_fitted:
+        share = percent(DEFAULT.curves.min_unexplained_share)
+        return [
+            f"Measured curves are not fitted: the model leaves less than {share} of the refit's squared excess over "
+            "the noise floor."
+        ]
+    return [_rejection(each) for each in trial.rejected]
+
+
+def _rejection(rejected: RejectedCurves) -> str:
+    """The curves that were fitted and not accepted, with the test that they did not pass."""
+    quantities = listed([_quantity(each) for each in rejected.curves])
+    z = rejected.standard_errors
+    test = "the loss on left-out blocks by"
+    size = f"{number(abs(z))} standard errors"
+    if z >= 0.0:
+        size += f", less than the required {number(rejected.min_standard_errors)}"
+    if len(rejected.curves) == 1:
+        verb = "raises" if z < 0.0 else "lowers"
+        return f"The measured curve of the {quantities} is fitted but not accepted: it {verb} {test} {size}."
+    verb = "raise" if z < 0.0 else "lower"
+    return f"The measured curves of the {quantities} are fitted but not accepted: together they {verb} {test} {size}."
+
+
+def _quantity(curve_id: str) -> str:
+    """Quantity of a measured curve: ``wheel angle``."""
+    curve = EFFECTS[curve_id]
+    assert isinstance(curve, MeasuredCurve)
+    return curve.quantity
 
 
 def curves_advice(diagnosis: Diagnosis) -> str:
