@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from carlab.cli.bench_output import command, write_figures
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, progress, table
+from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 def run_realcars(options: BenchOptions) -> int:
     """Diagnose the recordings to fit, and print the errors of all models on the held-out recordings."""
     from carlab.api import diagnose
-    from carlab.cli.diagnose import EXIT_INCONCLUSIVE
     from carlab.diagnosis.report.events import diagnosed_event_sentences
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.studies.real_cars import as_json, real_car_errors, split_by_name

@@ -8,7 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from carlab.cli.console import console, progress
+from carlab.cli.console import console, fail, progress
+from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import arguments_of, report_folder
 
 
@@ -17,7 +18,8 @@ class Compare:
     """Find what changed between two groups of drives of one car: another day, battery, floor, tyre or set-up.
 
     Names the smallest set of effects and parameters that differ, each with a 90 % interval, and writes compare.json.
-    Each group needs 50 s of driving. ^C ends the search; compare.json then has the changes found so far.
+    Each group needs 50 s of driving. ^C ends the search; compare.json then has the changes found so far. Exit code 0
+    with a verdict, 5 if the recordings are not sufficient, or if the search ended before it found a change.
     """
 
     recordings: Positional[tuple[Path, ...]]
@@ -52,6 +54,9 @@ class Compare:
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
                 stop=interrupts.requested.is_set,
             )
+        if found.verdict == "inconclusive":
+            fail(found.sentence)
+            return EXIT_INCONCLUSIVE
         console.print(found.sentence)
         for change in found.changes:
             console.print(f"  {change.sentence}")

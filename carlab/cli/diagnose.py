@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, fail, progress
+from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import arguments_of, report_folder
 from carlab.cli.recordings import print_errors
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import Diagnosis
-
-EXIT_INCONCLUSIVE = 5
 
 
 @dataclass

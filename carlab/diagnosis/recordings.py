@@ -24,13 +24,14 @@ from sim_backends.car_parameters import SimulatorConfig
 
 
 class Inconclusive(DataError):
-    """The recordings do not allow a verdict about the simulator; the message states why and what to record.
+    """The recordings do not allow a verdict; the message states why and what to record.
 
     Attributes:
         data_faults: faults found so far.
         verdict: "data" if faults make most of the recordings unusable.
     """
 
+    exit_code = 5
     data_faults: tuple[DataFault, ...] = ()
     verdict: Verdict = "inconclusive"
 

@@ -8,11 +8,13 @@ import pytest
 
 import carlab
 from carlab.cli import run
+from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.core.errors import ConfigError, DataError
 from carlab.diagnosis.comparison.compare import compare
-from carlab.diagnosis.comparison.result import Change
+from carlab.diagnosis.comparison.result import Change, Comparison
 from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.fit_parameters import with_effect
+from carlab.diagnosis.recordings import Inconclusive
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -76,7 +78,7 @@ def test_same_car_has_no_change(first, seed):
 def test_stop_without_a_change_is_inconclusive(first):
     stopped = compare([first], [first], CAR, stop=lambda: True)
     assert (stopped.verdict, stopped.changes) == ("inconclusive", ())
-    assert stopped.sentence == "The comparison was stopped before all candidates were tested."
+    assert stopped.sentence == "The comparison was stopped before it found a change. Compare again for a result."
 
 
 def test_stop_after_a_change_is_stated(first, slower_servo):
@@ -116,14 +118,31 @@ def test_unusable_groups_are_refused_with_one_sentence(first):
         carlab.compare([first], [first], "sim", candidates=["spoiler"])
 
 
-def test_verb_writes_the_result_of_the_call(first, tmp_path, capsys):
+def csv_files(folder, *episodes):
+    """The recordings as CSV files."""
     paths = []
-    for k, episode in enumerate((first, second(CAR))):
+    for k, episode in enumerate(episodes):
         names = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
         commands = np.vstack([episode.sent, episode.sent[-1:]])
         rows = np.column_stack([episode.times_s, episode.states, commands])
-        paths.append(tmp_path / f"group_{k}.csv")
+        paths.append(folder / f"group_{k}.csv")
         np.savetxt(paths[-1], rows, delimiter=",", header=",".join(names), comments="", fmt="%.7g")
+    return paths
+
+
+def test_verb_without_a_verdict_has_the_exit_code_of_a_diagnosis_without_one(first, tmp_path, capsys, monkeypatch):
+    paths = csv_files(tmp_path, first, drive(CAR, 20.0, 3))
+    arguments = ["compare", str(paths[0]), "--with", str(paths[1]), "--out", str(tmp_path / "out")]
+    assert run(arguments) == EXIT_INCONCLUSIVE == Inconclusive.exit_code
+    assert "second group has 20 s of driving" in " ".join(capsys.readouterr().err.split())
+    undecided = Comparison("inconclusive", "The comparison was stopped.", is_complete=False)
+    monkeypatch.setattr("carlab.api.compare", lambda *arguments, **options: undecided)
+    assert run(arguments) == EXIT_INCONCLUSIVE
+    assert undecided.sentence in capsys.readouterr().err
+
+
+def test_verb_writes_the_result_of_the_call(first, tmp_path, capsys):
+    paths = csv_files(tmp_path, first, second(CAR))
     arguments = ["compare", str(paths[0]), "--with", str(paths[1]), "--candidates", "motor_lag", "steering_offset"]
     assert run([*arguments, "--out", str(tmp_path / "out")]) == 0
     assert "These recordings show no change" in capsys.readouterr().out

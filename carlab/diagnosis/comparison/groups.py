@@ -18,7 +18,7 @@ from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
 from carlab.diagnosis.recording_faults import find as data_faults_of
-from carlab.diagnosis.recordings import check_excitation
+from carlab.diagnosis.recordings import Inconclusive, check_excitation
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.refit import fit_with_scale
 from carlab.diagnosis.settings import DiagnosisSettings
@@ -112,13 +112,13 @@ def _errors(fitter: Fitter, config: SimulatorConfig) -> FloatArray:
 
 
 def _checked_segments(episodes: Sequence[EpisodeData], k: int, settings: DiagnosisSettings) -> list[RecordingSegment]:
-    """Segments of a group. Raises DataError if it is too short or too uniform."""
+    """Segments of a group. Raises Inconclusive if it is too short or too uniform."""
     which = ("first", "second")[k]
     segments = segments_of(episodes)
     seconds = sum(segment.duration_s for segment in segments)
     needed_s = settings.comparison.block_s * settings.comparison.min_blocks
     if seconds < needed_s:
-        raise DataError(
+        raise Inconclusive(
             f"The {which} group has {seconds:.0f} s of driving; a comparison needs {needed_s:.0f} s in each group."
         )
     check_excitation(segments, settings.windows)
@@ -130,7 +130,7 @@ def _windows(segments: Sequence[RecordingSegment], settings: DiagnosisSettings) 
         segments, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s
     )
     if len(np.unique(cut.block)) < settings.comparison.min_blocks:
-        raise DataError("The car moves too little in one group; record at least one minute of driving.")
+        raise Inconclusive("The car moves too little in one group; record at least one minute of driving.")
     return cut.thinned(settings.windows.max_fit_windows)
 
 

@@ -96,7 +96,7 @@ class Comparison:
 def verdict_sentence(verdict: ComparisonVerdict, changes: Sequence[Change], *, is_complete: bool) -> str:
     """The verdict of a comparison that has enough data; ``is_complete``: whether no stop ended it."""
     if verdict == "inconclusive":
-        return "The comparison was stopped before all candidates were tested."
+        return "The comparison was stopped before it found a change. Compare again for a result."
     if not changes:
         return "These recordings show no change of the car between the two groups."
     falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
