@@ -9,11 +9,8 @@ import numpy as np
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.ceiling import ceiling_of
-from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
-from carlab.diagnosis.curves.support import curve_findings, without_extrapolation
+from carlab.diagnosis.curves.support import curve_findings
 from carlab.diagnosis.decisions import Decision
-from carlab.diagnosis.drift import Adaptation, adapt_to_held_out
 from carlab.diagnosis.evidence import (
     ScoredSearch,
     Texts,
@@ -22,7 +19,15 @@ from carlab.diagnosis.evidence import (
     unexplained_share,
     verdict_of,
 )
-from carlab.diagnosis.findings import Ceiling, CurveTrial, DataFault, Diagnosis, FigureData, FitErrors, RecordingUse
+from carlab.diagnosis.final_models import (
+    Request,
+    adapted,
+    ceiling_by_networks,
+    errors_with_events,
+    measured_curves,
+    trained_models,
+)
+from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, most_complete
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -45,8 +50,8 @@ from carlab.diagnosis.state_alignment import naming_lost_frames, with_known_late
 from carlab.diagnosis.uncertain_effects import without_uncertain_effects
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.jobs.function_workers import FunctionWorkers
-from carlab.prediction.network_ensemble import EnsembleSettings, check_duration, train_ensemble
-from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
+from carlab.prediction.network_ensemble import EnsembleSettings, check_duration
+from carlab.prediction.predict import PredictiveModel
 from carlab.prediction.windows import PredictionWindows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
@@ -65,25 +70,6 @@ class Outcome:
     model: SimulatorConfig
     models: Mapping[str, PredictiveModel]
     held_out_windows: PredictionWindows
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """Arguments of ``diagnose``."""
-
-    nominal: SimulatorConfig
-    texts: Texts
-    uses: Sequence[RecordingUse]
-    data_faults: Sequence[DataFault]
-    effects: Sequence[str] | None
-    held_out_share: float
-    seed: int
-    settings: DiagnosisSettings
-    curves: bool
-    ceiling: bool
-    discrepancy: bool
-    adapt: bool
-    keep_events: bool
 
 
 def diagnose(
@@ -242,15 +228,16 @@ def _assemble_result(
         scored, request.texts, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share)
     )
     share = unexplained_share(scored)
-    unexplained, model = None, None
+    unexplained, described = None, None
     if share >= request.settings.evidence.unexplained_share_min:
         error = scored.errors["with_effects"]
-        unexplained, model = describe_unexplained(scored.problem, naming, share, error, held_out)
+        unexplained, described = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
-    measured, curve_trial = _measured_curves(scored, share, recordings, request, control)
-    adaptation = _adaptation(scored, measured, recordings, request, control)
-    models = _models(scored, measured, adaptation, recordings, request, control)
-    model = model if measured is None else measured.fit.config
+    measured, curve_trial = measured_curves(scored, described, recordings, request, control)
+    corrected = scored if described is None else replace(scored, fit=described, is_joint=False)
+    corrected = corrected if measured is None else replace(scored, fit=measured.fit)
+    adaptation = adapted(corrected, recordings, request, control)
+    models = trained_models(scored, described, measured, adaptation, recordings, request, control)
     progress("preparing the report", 0.95)
     final_errors = {name: held_out.final_error(each) for name, each in models.items()}
     held_out_errors = {name: held_out.summary(error) for name, error in final_errors.items()}
@@ -260,7 +247,7 @@ def _assemble_result(
         verdict=verdict,
         sentence="",
         effects=findings if verdict == "mismatch" else (),
-        parameters=base_estimates(scored if measured is None else replace(scored, fit=measured.fit)),
+        parameters=base_estimates(corrected),
         horizon_s=request.settings.windows.held_out_window_s,
         held_out=held_out_errors,
         unexplained=unexplained,
@@ -270,125 +257,21 @@ def _assemble_result(
         seconds=0.0,
         curves=() if measured is None else curve_findings(measured, request.nominal, segments, settings),
         curve_trial=curve_trial,
-        ceiling=_ceiling(held_out_errors),
+        ceiling=ceiling_by_networks(held_out_errors),
         skill=skill_of(
             held_out.windows,
-            final_errors.get("with_curves", final_errors["with_effects"]),
+            final_errors[most_complete(final_errors)],
             final_errors["constant_velocity"],
             request.settings.evidence,
         ),
         drift=() if adaptation is None else adaptation.drift,
         events=recordings.events,
-        held_out_with_events=_errors_with_events(models, final_errors, held_out, recordings.event_windows),
+        held_out_with_events=errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )
     figure_data = figure_data_of(scored, recordings)
     noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
     figure_data = replace(figure_data, noise=noise)
-    return Outcome(diagnosis, figure_data, model or scored.found.best.config, models, held_out.windows)
-
-
-def _errors_with_events(
-    models: Mapping[str, PredictiveModel],
-    errors: Mapping[str, FloatArray],
-    held_out: HeldOut,
-    event_windows: PredictionWindows,
-) -> dict[str, FitErrors]:
-    """Held-out errors of all models with the windows that events left out; empty without such windows."""
-    if not len(event_windows):
-        return {}
-    return {name: held_out.summary_with(event_windows, errors[name], model) for name, model in models.items()}
-
-
-def _measured_curves(
-    scored: ScoredSearch, unexplained: float, recordings: SplitRecordings, request: Request, control: RunControl
-) -> tuple[CurveFit | None, CurveTrial | None]:
-    """Measured curves if they are wanted, and named effects leave a residual that a curve may explain."""
-    settings = request.settings.curves
-    if not request.curves:
-        return None, None
-    if unexplained < settings.min_unexplained_share:
-        return None, CurveTrial(is_fitted=False)
-    found, rejected = (None, ()) if control.stop() else fit_curves(scored.problem, scored.found, control)
-    if found is not None:
-        return without_extrapolation(found, recordings.fit_segments, settings), CurveTrial(True, rejected)
-    if control.stop():
-        control.omit("measured curves")
-        return None, None
-    return None, CurveTrial(True, rejected)
-
-
-def _models(
-    scored: ScoredSearch,
-    measured: CurveFit | None,
-    adaptation: Adaptation | None,
-    recordings: SplitRecordings,
-    request: Request,
-    control: RunControl,
-) -> dict[str, PredictiveModel]:
-    """All models whose held-out errors are reported; networks are trained on the recordings to fit.
-
-    A network whose training the user ended is omitted: its error says nothing about what can be predicted.
-    """
-    found = scored.found
-    models: dict[str, PredictiveModel] = {
-        "nominal": SimulatorModel(scored.problem.nominal),
-        "refit": SimulatorModel(found.base.config),
-        "with_effects": SimulatorModel(found.best.config),
-    }
-    if measured is not None:
-        models["with_curves"] = SimulatorModel(measured.fit.config)
-
-    diagnosed = models.get("with_curves", models["with_effects"])
-    networks = (
-        ("with_discrepancy", "learned discrepancy", request.discrepancy, diagnosed),
-        ("black_box", "black box", request.ceiling, None),
-    )
-    for key, name, is_requested, simulator in networks:
-        if not is_requested:
-            continue
-        trained = train_ensemble(
-            recordings.fit_segments,
-            simulator=simulator,
-            seed=request.seed,
-            velocity_window_s2=recordings.fit_windows.velocity_window_s2,
-            progress=control.progress,
-            stop=control.stop,
-        )
-        if control.stop():
-            control.omit(name)
-        else:
-            models[key] = trained
-    if adaptation is not None:
-        models["adapted"] = adaptation.model
-    return models | {"constant_velocity": ConstantVelocity()}
-
-
-def _adaptation(
-    scored: ScoredSearch,
-    measured: CurveFit | None,
-    recordings: SplitRecordings,
-    request: Request,
-    control: RunControl,
-) -> Adaptation | None:
-    """The corrected simulator adapted along the held-out recordings, if it is wanted."""
-    if not request.adapt:
-        return None
-    if control.stop():
-        control.omit("adaptation")
-        return None
-    control.progress("adapting along the held-out recordings", 0.93)
-    config = scored.found.best.config if measured is None else measured.fit.config
-    segments = recordings.fit_segments, recordings.held_out_segments
-    return adapt_to_held_out(config, *segments, scored.held_out, request.settings.drift)
-
-
-def _ceiling(errors: Mapping[str, FitErrors]) -> Ceiling | None:
-    """The ceiling by the better of black box and learned discrepancy; None without both."""
-    networks = [errors[name].score for name in ("black_box", "with_discrepancy") if name in errors]
-    if not networks:
-        return None
-    model = errors.get("with_curves", errors["with_effects"])
-    return ceiling_of(errors["refit"].score, model.score, min(networks))
+    return Outcome(diagnosis, figure_data, corrected.fit.config, models, held_out.windows)
 
 
 __all__ = ["Inconclusive", "Outcome", "Texts", "diagnose"]

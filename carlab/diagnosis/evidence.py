@@ -232,13 +232,15 @@ def verdict_of(scored: ScoredSearch, has_unnamed: bool, data_faults: Sequence[Da
     return "parameters" if is_significant and is_large and lowers_score else "none"
 
 
-def unexplained_share(scored: ScoredSearch) -> float:
-    """Share of the refit's squared excess that remains with the accepted effects."""
+def unexplained_share(scored: ScoredSearch, described: Fit | None = None) -> float:
+    """Share of the refit's squared excess that remains with the accepted effects, or with the fit ``described``."""
     score = scored.scores()
     excess = score["refit"] ** 2 - 1.0
     if excess <= scored.problem.settings.evidence.min_explained_excess:
         return 0.0
-    return max(score["with_effects"] ** 2 - 1.0, 0.0) / excess
+    held_out = scored.held_out
+    remaining = score["with_effects"] if described is None else held_out.score(held_out.final_error(described.config))
+    return max(remaining**2 - 1.0, 0.0) / excess
 
 
 __all__ = [

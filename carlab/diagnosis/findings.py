@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -253,10 +253,11 @@ class SearchExtent:
 class Diagnosis:
     """Result of a diagnosis.
 
-    ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; with measured curves also
-    with_curves, with a ceiling also black_box, with a discrepancy also with_discrepancy. ``held_out_with_events`` has
-    the same models, scored with the windows that events left out; empty without such windows. ``curve_trial`` is None
-    without measured curves as a stage, and if the user ended it.
+    ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; if uncatalogued physics describes
+    the residual also with_uncatalogued_physics, with measured curves also with_curves, with a ceiling also black_box,
+    with a discrepancy also with_discrepancy. ``held_out_with_events`` has the same models, scored with the windows that
+    events left out; empty without such windows. ``curve_trial`` is None without measured curves as a stage, and if the
+    user ended it.
     """
 
     verdict: Verdict
@@ -325,6 +326,12 @@ class Diagnosis:
 def _drift_table(drift: Drift) -> dict[str, Any]:
     table = asdict(replace(drift, t_s=np.zeros(0), mean=np.zeros(0), std=np.zeros(0)))
     return table | {name: getattr(drift, name).tolist() for name in ("t_s", "mean", "std")}
+
+
+def most_complete(models: Iterable[str]) -> str:
+    """Name of the model that model.toml contains, of the names of all models."""
+    names = set(models)
+    return next((n for n in ("with_curves", "with_uncatalogued_physics") if n in names), "with_effects")
 
 
 @dataclass(frozen=True, slots=True)

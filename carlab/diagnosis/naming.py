@@ -17,6 +17,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_rival import curve_in_addition, replacing_curve
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.findings import Unexplained
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.correlated_errors import without_unsupported_effects
@@ -26,7 +27,6 @@ from carlab.diagnosis.selection.search import restrict
 from carlab.diagnosis.unexplained.description import ResidualModel, describe, fit_residual_terms, start_features
 from carlab.diagnosis.unexplained.vibration import Vibration
 from carlab.diagnosis.weak_effects import without_harmful_effects, without_negligible_effects
-from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects.curves import SteeringCurve
 
 log = logging.getLogger(__name__)
@@ -257,18 +257,18 @@ def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldO
 class Description:
     """Class statement and formula of missing physics, and the fall of each channel's squared error with it.
 
-    ``fall`` is (6,) in squared noise floors.
+    ``fall`` is (6,) in squared noise floors; ``fit`` is that with uncatalogued physics, if that describes the residual.
     """
 
     class_statement: str
     formula: str
     fall: FloatArray
-    model: SimulatorConfig | None = None
+    fit: Fit | None = None
 
 
 def describe_unexplained(
     problem: SearchProblem, naming: NamingResult, share: float, error: FloatArray, held_out: HeldOut
-) -> tuple[Unexplained, SimulatorConfig | None]:
+) -> tuple[Unexplained, Fit | None]:
     """Describe the unexplained residual for the report.
 
     Args:
@@ -279,7 +279,7 @@ def describe_unexplained(
         held_out: windows and noise floor.
 
     Returns:
-        The description, and the simulator with uncatalogued physics if that describes the residual.
+        The description, and the fit with uncatalogued physics, with covariance, if that describes the residual.
     """
     residual = naming.residual
     if not naming.has_unnamed:
@@ -296,7 +296,8 @@ def describe_unexplained(
     window_errors: FloatArray = np.sqrt(squared.mean(axis=1))
     features = start_features(held_out.windows)
     entry = describe(share, description.class_statement, description.formula, fall, window_errors, features)
-    return entry, description.model
+    fit = None if description.fit is None else problem.fitter(naming.found.scale).with_covariance(description.fit)
+    return entry, fit
 
 
 def _describe_by_rival(
@@ -309,12 +310,10 @@ def _describe_by_rival(
     if rival.gain <= problem.settings.rivals.description_ratio * residual.gain:
         return None
     after = held_out.final_error(rival.fit.config)
-    score, score_with_rival = held_out.score(error), held_out.score(after)
-    if score_with_rival >= score:
+    if held_out.score(after) >= held_out.score(error):
         return None
     fall = np.mean((error / held_out.floor) ** 2 - (after / held_out.floor) ** 2, axis=0)
-    scores = f"held-out score {score_with_rival:.3g} with it in model.toml, {score:.3g} without"
-    return Description(f"{rival.class_statement()} ({scores})", rival.formula(), fall, rival.fit.config)
+    return Description(rival.class_statement(), rival.formula(), fall, rival.fit)
 
 
 def _with_vibration(
@@ -330,7 +329,7 @@ def _with_vibration(
         ". ".join(statement for statement, _ in parts),
         "; ".join(formula for _, formula in parts),
         excess if first else made.fall,
-        made.model,
+        made.fit,
     )
 
 

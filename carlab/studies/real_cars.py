@@ -20,6 +20,7 @@ MODEL_NAMES = {
     "nominal": "car file",
     "refit": "refit",
     "with_effects": "diagnosed",
+    "with_uncatalogued_physics": "diagnosed, physics outside the catalogue",
     "with_curves": "diagnosed, measured curves",
     "with_discrepancy": "diagnosed, learned discrepancy",
     "black_box": "black box",

@@ -21,12 +21,11 @@ from carlab.diagnosis.findings import (
     Unexplained,
 )
 from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
+from carlab.diagnosis.report.next_drive import drive_command, next_drive
+from carlab.diagnosis.report.residual import explained_share
 from carlab.diagnosis.report.sentences import (
     confidence_text,
-    drive_command,
     effect_sentence,
-    explained_share,
-    next_drive,
     number,
     percent,
     refutation_sentence,

@@ -9,6 +9,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import CurveFinding, Diagnosis, RejectedCurves
 from carlab.diagnosis.report.figures import Figure
+from carlab.diagnosis.report.residual import relevant_residual, remaining_share
 from carlab.diagnosis.report.sentences import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.svg import Chart, padded
 from carlab.diagnosis.settings import DEFAULT, ReportSettings
@@ -69,11 +70,12 @@ def _quantity(curve_id: str) -> str:
 
 
 def curves_advice(diagnosis: Diagnosis) -> str:
-    """Advice to measure curves if a diagnosis without them leaves a relevant residual; else empty."""
-    rest = diagnosis.unexplained
-    if rest is None or rest.share < DEFAULT.curves.min_unexplained_share or diagnosis.curves:
+    """Advice to measure curves if a complete diagnosis without them leaves a relevant residual; else empty."""
+    if diagnosis.curves or not diagnosis.search.covers_catalogue:
         return ""
-    if diagnosis.verdict not in ("mismatch", "unexplained"):
+    if diagnosis.verdict not in ("mismatch", "unexplained") or relevant_residual(diagnosis) is None:
+        return ""
+    if remaining_share(diagnosis) < DEFAULT.curves.min_unexplained_share:
         return ""
     return (
         "Measured curves of drive force, steering and tyres may explain a part of the rest: add --curves. "

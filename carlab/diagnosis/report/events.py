@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from carlab.diagnosis.events import Event, EventUse
-from carlab.diagnosis.findings import Diagnosis, FitErrors
+from carlab.diagnosis.findings import Diagnosis, FitErrors, most_complete
 from carlab.diagnosis.report.numbers import number, with_unit
 
 KINDS = {"impact": "impact", "carried": "carried sideways"}
@@ -30,8 +30,8 @@ def event_sentences(use: EventUse, without: FitErrors | None = None, with_them: 
 
 
 def diagnosed_event_sentences(diagnosis: Diagnosis) -> list[str]:
-    """The same for the most complete model of a diagnosis: with measured curves, or with effects."""
-    name = "with_curves" if "with_curves" in diagnosis.held_out else "with_effects"
+    """The same for the most complete model of a diagnosis, which model.toml contains."""
+    name = most_complete(diagnosis.held_out)
     return event_sentences(diagnosis.events, diagnosis.held_out.get(name), diagnosis.held_out_with_events.get(name))
 
 

@@ -20,6 +20,7 @@ LABELS = {
     "nominal": "nominal (car file as given)",
     "refit": "refit (fitted parameters)",
     "with_effects": "with effects",
+    "with_uncatalogued_physics": "with physics outside the catalogue",
     "with_curves": "with measured curves",
     "with_discrepancy": "with a learned discrepancy",
     "black_box": "black box",

@@ -15,6 +15,8 @@ from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve
 from carlab.diagnosis.report.drift import drift_sentences
 from carlab.diagnosis.report.drift_charts import drift_charts
 from carlab.diagnosis.report.events import diagnosed_event_sentences
+from carlab.diagnosis.report.next_drive import drive_command, next_drive
+from carlab.diagnosis.report.residual import explained_share, relevant_residual
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
@@ -35,8 +37,9 @@ def render_page(diagnosis: Diagnosis, figure_data: FigureData) -> str:
 def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any]:
     """Variables of the template. Figures contain effects only if the verdict names some."""
     figure_data = figure_data if diagnosis.effects else figures.without_effects(figure_data)
-    drive, why = text.next_drive(diagnosis)
-    rest = diagnosis.unexplained
+    drive, why = next_drive(diagnosis)
+    command = drive_command(drive)
+    rest = relevant_residual(diagnosis)
     worst = figures.worst_stretch(figure_data.traces)
     candidates = sorted((c for c in figure_data.candidates if math.isfinite(c[1])), key=lambda c: -c[1])
     return {
@@ -53,8 +56,8 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "in_time": [(t.name, f, t.marked) for t in figure_data.traces if (f := figures.error_in_time(t)) is not None],
         "regimes": figures.regime_charts(figure_data),
         "score_chart": figures.score_chart(figure_data),
-        "explained": text.explained_share(diagnosis),
-        "known": bool(diagnosis.effects) and math.isfinite(text.explained_share(diagnosis)),
+        "explained": explained_share(diagnosis),
+        "known": bool(diagnosis.effects) and math.isfinite(explained_share(diagnosis)),
         "driven": bool(figure_data.traces),
         "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
         "candidate_count": len(figure_data.candidates),
@@ -64,12 +67,12 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "drift": [(d, drift_charts(d)) for d in diagnosis.drift],
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),
-        "rest": rest if rest is not None and rest.share >= DEFAULT.evidence.unexplained_share_min else None,
+        "rest": rest,
         "rest_where": text.listed([text.CHANNEL_NAMES.get(c, c) for c in rest.channels]) if rest else "",
         "rest_regime": text.regime_clause(rest.regime) if rest else "",
-        "drive": text.drive_command(drive),
+        "drive": command,
         "drive_name": drive,
-        "why": why,
+        "why": why.removesuffix(f" Drive it with: {command}"),
         "parameters": [(name, e, _bar(e)) for name, e in diagnosis.parameters.items()],
         "channels": text.CHANNEL_NAMES,
     }
@@ -86,7 +89,7 @@ def _bar(e: Estimate) -> Any:
 
 def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Scores of the models, for the head of the page."""
-    order = ("nominal", "refit", "with_effects", "with_curves", "noise_floor")
+    order = ("nominal", "refit", "with_effects", "with_uncatalogued_physics", "with_curves", "noise_floor")
     shown = [k for k in order if k in diagnosis.held_out and (k != "with_effects" or diagnosis.effects)]
     return [{"label": figures.LABELS[k], "errors": diagnosis.held_out[k], "style": k} for k in shown]
 
@@ -117,7 +120,7 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
         "evidence_texts": _evidence_texts(effect),
         "parameters": [(name, e, _bar(e)) for name, e in effect.parameters.items()],
         "others": [(other, text.effect_noun(other)) for other in effect.indistinguishable_from],
-        "drive": text.drive_command(drive),
+        "drive": drive_command(drive),
         "reason": text.separating_reason(effect.id, effect.indistinguishable_from)
         if effect.indistinguishable_from
         else "",

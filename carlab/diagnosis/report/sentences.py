@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
 from carlab.diagnosis.report.numbers import listed as listed
@@ -17,6 +16,7 @@ from carlab.diagnosis.report.numbers import number as number
 from carlab.diagnosis.report.numbers import percent as percent
 from carlab.diagnosis.report.numbers import unit_text as unit_text
 from carlab.diagnosis.report.numbers import with_unit as with_unit
+from carlab.diagnosis.report.residual import explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
@@ -206,13 +206,31 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    tails = _with_curves(diagnosis), _with_drift(diagnosis), search_sentences(diagnosis.search)
+    tails = (
+        _with_uncatalogued(diagnosis),
+        _with_curves(diagnosis),
+        _with_drift(diagnosis),
+        search_sentences(diagnosis.search),
+    )
     return f"{worse_than_constant_velocity(diagnosis)}{sentence_of_verdict(diagnosis)}{''.join(tails)}"
 
 
 def _with_drift(diagnosis: Diagnosis) -> str:
     """What changed in the car since the fitted recordings; empty without a drift."""
     return "".join(f" {drift_sentence(d, diagnosis.horizon_s)}" for d in diagnosis.drift if d.is_drift)
+
+
+def _with_uncatalogued(diagnosis: Diagnosis) -> str:
+    """The held-out error with physics outside the catalogue; empty without it."""
+    if "with_uncatalogued_physics" not in diagnosis.held_out:
+        return ""
+    found = diagnosis.held_out["with_uncatalogued_physics"]
+    where = "" if diagnosis.curves else " model.toml contains it."
+    position = with_unit(found.position_m, "m")
+    return (
+        f" With physics outside the catalogue, the held-out position error is {position} (all channels: "
+        f"{number(found.score)} noise floors).{where}"
+    )
 
 
 def _with_curves(diagnosis: Diagnosis) -> str:
@@ -222,7 +240,9 @@ def _with_curves(diagnosis: Diagnosis) -> str:
     found = diagnosis.held_out["with_curves"]
     curves = f"{len(diagnosis.curves)} measured curves" if len(diagnosis.curves) > 1 else "a measured curve"
     position = with_unit(found.position_m, "m")
-    return f" With {curves}, the held-out error is {position} ({number(found.score)} noise floors)."
+    return (
+        f" With {curves}, the held-out position error is {position} (all channels: {number(found.score)} noise floors)."
+    )
 
 
 def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
@@ -260,15 +280,6 @@ def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
     )
 
 
-def explained_share(diagnosis: Diagnosis) -> float:
-    """Share of the refit's squared excess over the noise floor that the effects explain, at most 1; NaN if unknown."""
-    held = diagnosis.held_out
-    if "refit" not in held or "with_effects" not in held or not held["refit"].score > 1.0:
-        return math.nan
-    refit, with_effects = (held[name].score ** 2 - 1.0 for name in ("refit", "with_effects"))
-    return 1.0 - max(with_effects, 0.0) / refit
-
-
 def _mismatch(diagnosis: Diagnosis) -> str:
     effects, text = diagnosis.effects, " ".join(_statements(diagnosis.effects))
     if fall := _fall(diagnosis, "refit", "with_effects"):
@@ -277,9 +288,9 @@ def _mismatch(diagnosis: Diagnosis) -> str:
         named = "it" if len(effects) == 1 else "them"
         named = "corrected numbers" if effects and all(e.car_file_values for e in effects) else named
         text += f" With {named}, {fall}{known if math.isfinite(share) else ''}."
-    if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
-        text += f" Of this excess, {percent(diagnosis.unexplained.share)} stays unexplained."
-    return text
+    if (rest := relevant_residual(diagnosis)) is not None:
+        return f"{text} Of this excess, {percent(rest.share)} stays unexplained."
+    return f"{text}{_warning_above_noise(diagnosis, 'with_effects')}"
 
 
 def _statements(effects: Sequence[EffectFinding]) -> list[str]:
@@ -304,8 +315,7 @@ def _parameters(diagnosis: Diagnosis) -> str:
 
 def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
     """A warning if the score stays well above the noise floor; else empty."""
-    held = diagnosis.held_out.get(which)
-    if held is None or not held.score > DEFAULT.report.score_above_noise:
+    if not is_above_noise(diagnosis, which):
         return ""
     return " This error is above the noise: the simulator lacks physics that the diagnosis does not find."
 
@@ -355,42 +365,3 @@ def regime_clause(regime: str) -> str:
     if not regime or regime == "everywhere alike":
         return "equally in all driving conditions"
     return f"mostly where {regime}"
-
-
-def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
-    """The manoeuvre to drive next (empty if none would help) and the reason."""
-    for effect in diagnosis.effects:
-        if effect.indistinguishable_from:
-            drive = effect.separating_drive
-            drive = drive if drive in MANOEUVRES else separating_drive(effect.id, effect.indistinguishable_from)
-            reason = separating_reason(effect.id, effect.indistinguishable_from)
-            others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
-            return drive, f"These recordings do not distinguish {effect_noun(effect.id)} from {others}. {reason}"
-    advice = diagnosis.advice or (diagnosis.sentence if diagnosis.verdict == "inconclusive" else "")
-    if diagnosis.verdict == "data":
-        return "", advice or "Correct the recording or record again. Then diagnose again."
-    if diagnosis.verdict == "inconclusive":
-        drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
-        own = advice if advice != diagnosis.sentence else ""
-        return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
-    if diagnosis.verdict == "unexplained" and not diagnosis.search.covers_catalogue:
-        how = "without --effects" if diagnosis.search.effects else "with a longer time limit"
-        return "", f"Diagnose these recordings again {how}, before another drive."
-    if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
-        channels = diagnosis.unexplained.channels
-        along = bool(channels) and channels[0] in ("x", "vx")
-        motion = "longitudinal" if along else "lateral"
-        return (
-            "coast_down" if along else "steering_chirp",
-            advice or f"The residual is in the {motion} motion. Record a drive that excites it.",
-        )
-    if diagnosis.verdict == "mismatch":
-        return "figure_eight", advice or (
-            "The best test of model.toml is a new recording that was neither fitted nor held out here."
-        )
-    return "", advice or "No further drive is needed. Diagnose again when the car, its tyres or the floor change."
-
-
-def drive_command(manoeuvre: str) -> str:
-    """The command line that drives a manoeuvre; empty for none."""
-    return f"carlab drive --policy {manoeuvre} --no-place" if manoeuvre else ""

@@ -17,6 +17,7 @@ from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import to_dict
 from carlab.diagnosis.findings import Diagnosis, FigureData
 from carlab.diagnosis.report import sentences as text
+from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.recording.atomic_files import write_text
 from carlab.recording.sink import describe_os_error, make_folder
 from sim_backends.car_parameters import SimulatorConfig
@@ -80,8 +81,8 @@ def write_decisions(figure_data: FigureData, folder: Path) -> Path:
 def completed(diagnosis: Diagnosis) -> Diagnosis:
     """The diagnosis with default sentences and advice where it has none."""
     sentence = diagnosis.sentence or text.verdict_sentence(diagnosis)
-    drive, why = text.next_drive(diagnosis)
-    command = text.drive_command(drive)
+    drive, why = next_drive(diagnosis)
+    command = drive_command(drive)
     advice = diagnosis.advice or (f"{why} Drive it with: {command}" if command else why)
     effects = tuple(
         replace(e, sentence=e.sentence or text.effect_sentence(e.id, e.parameters, e.car_file_values))
@@ -104,7 +105,9 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoi
             lines.append(f"These recordings do not distinguish {effect.id} from {others}.")
     lines += [f"Fitted to: {path}" for path in fitted] or ["Not fitted: the car file as given."]
     scores = [
-        f"{name} {text.number(held[name].score)}" for name in ("nominal", "refit", "with_effects") if name in held
+        f"{name} {text.number(held[name].score)}"
+        for name in ("nominal", "refit", "with_effects", "with_uncatalogued_physics", "with_curves")
+        if name in held
     ]
     if scores:
         lines.append(f"Held-out error in noise floors: {', '.join(scores)}.")

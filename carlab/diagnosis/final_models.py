@@ -1,0 +1,156 @@
+"""Models of a diagnosis after its search: uncatalogued physics, measured curves, networks, adaptation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.ceiling import ceiling_of
+from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
+from carlab.diagnosis.curves.support import without_extrapolation
+from carlab.diagnosis.drift import Adaptation, adapt_to_held_out
+from carlab.diagnosis.evidence import ScoredSearch, Texts, unexplained_share
+from carlab.diagnosis.findings import Ceiling, CurveTrial, DataFault, FitErrors, RecordingUse, most_complete
+from carlab.diagnosis.identification.fit import Fit
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.recordings import SplitRecordings
+from carlab.diagnosis.selection.problem import RunControl
+from carlab.diagnosis.settings import DiagnosisSettings
+from carlab.prediction.network_ensemble import train_ensemble
+from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Arguments of ``diagnose``."""
+
+    nominal: SimulatorConfig
+    texts: Texts
+    uses: Sequence[RecordingUse]
+    data_faults: Sequence[DataFault]
+    effects: Sequence[str] | None
+    held_out_share: float
+    seed: int
+    settings: DiagnosisSettings
+    curves: bool
+    ceiling: bool
+    discrepancy: bool
+    adapt: bool
+    keep_events: bool
+
+
+def errors_with_events(
+    models: Mapping[str, PredictiveModel],
+    errors: Mapping[str, FloatArray],
+    held_out: HeldOut,
+    event_windows: PredictionWindows,
+) -> dict[str, FitErrors]:
+    """Held-out errors of all models with the windows that events left out; empty without such windows."""
+    if not len(event_windows):
+        return {}
+    return {name: held_out.summary_with(event_windows, errors[name], model) for name, model in models.items()}
+
+
+def measured_curves(
+    scored: ScoredSearch, described: Fit | None, recordings: SplitRecordings, request: Request, control: RunControl
+) -> tuple[CurveFit | None, CurveTrial | None]:
+    """Measured curves if they are wanted, and the model leaves a residual that a curve may explain.
+
+    Args:
+        scored: the search with its held-out errors.
+        described: fit with uncatalogued physics, if that describes the residual.
+        recordings: the recordings.
+        request: arguments of the diagnosis.
+        control: callbacks.
+
+    Returns:
+        The fit with accepted curves, and what the stage did; None without this stage, and if the user ended it.
+    """
+    settings = request.settings.curves
+    if not request.curves:
+        return None, None
+    if unexplained_share(scored, described) < settings.min_unexplained_share:
+        return None, CurveTrial(is_fitted=False)
+    found, rejected = (None, ()) if control.stop() else fit_curves(scored.problem, scored.found, control)
+    if found is not None:
+        return without_extrapolation(found, recordings.fit_segments, settings), CurveTrial(True, rejected)
+    if control.stop():
+        control.omit("measured curves")
+        return None, None
+    return None, CurveTrial(True, rejected)
+
+
+def trained_models(
+    scored: ScoredSearch,
+    described: Fit | None,
+    measured: CurveFit | None,
+    adaptation: Adaptation | None,
+    recordings: SplitRecordings,
+    request: Request,
+    control: RunControl,
+) -> dict[str, PredictiveModel]:
+    """All models whose held-out errors are reported; networks are trained on the recordings to fit.
+
+    A network whose training the user ended is omitted: its error says nothing about what can be predicted.
+    """
+    found = scored.found
+    models: dict[str, PredictiveModel] = {
+        "nominal": SimulatorModel(scored.problem.nominal),
+        "refit": SimulatorModel(found.base.config),
+        "with_effects": SimulatorModel(found.best.config),
+    }
+    if described is not None:
+        models["with_uncatalogued_physics"] = SimulatorModel(described.config)
+    if measured is not None:
+        models["with_curves"] = SimulatorModel(measured.fit.config)
+
+    networks = (
+        ("with_discrepancy", "learned discrepancy", request.discrepancy, models[most_complete(models)]),
+        ("black_box", "black box", request.ceiling, None),
+    )
+    for key, name, is_requested, simulator in networks:
+        if not is_requested:
+            continue
+        trained = train_ensemble(
+            recordings.fit_segments,
+            simulator=simulator,
+            seed=request.seed,
+            velocity_window_s2=recordings.fit_windows.velocity_window_s2,
+            progress=control.progress,
+            stop=control.stop,
+        )
+        if control.stop():
+            control.omit(name)
+        else:
+            models[key] = trained
+    if adaptation is not None:
+        models["adapted"] = adaptation.model
+    return models | {"constant_velocity": ConstantVelocity()}
+
+
+def adapted(
+    corrected: ScoredSearch, recordings: SplitRecordings, request: Request, control: RunControl
+) -> Adaptation | None:
+    """The corrected simulator, that of the fit, adapted along the held-out recordings, if it is wanted."""
+    if not request.adapt:
+        return None
+    if control.stop():
+        control.omit("adaptation")
+        return None
+    control.progress("adapting along the held-out recordings", 0.93)
+    segments = recordings.fit_segments, recordings.held_out_segments
+    return adapt_to_held_out(corrected.fit.config, *segments, corrected.held_out, request.settings.drift)
+
+
+def ceiling_by_networks(errors: Mapping[str, FitErrors]) -> Ceiling | None:
+    """The ceiling by the better of black box and learned discrepancy; None without both."""
+    networks = [errors[name].score for name in ("black_box", "with_discrepancy") if name in errors]
+    if not networks:
+        return None
+    return ceiling_of(errors["refit"].score, errors[most_complete(errors)].score, min(networks))
+
+
+__all__ = ["Request", "adapted", "ceiling_by_networks", "errors_with_events", "measured_curves", "trained_models"]

@@ -1,0 +1,53 @@
+"""The drive that a report advises, and its command."""
+
+from __future__ import annotations
+
+from carlab.core.manoeuvres import MANOEUVRES
+from carlab.diagnosis.findings import Diagnosis
+from carlab.diagnosis.report.numbers import listed
+from carlab.diagnosis.report.residual import relevant_residual, remaining_share
+from carlab.diagnosis.report.sentences import effect_noun, separating_drive, separating_reason
+from carlab.diagnosis.settings import DEFAULT
+
+
+def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
+    """The manoeuvre to drive next (empty if none would help) and the reason."""
+    for effect in diagnosis.effects:
+        if effect.indistinguishable_from:
+            drive = effect.separating_drive
+            drive = drive if drive in MANOEUVRES else separating_drive(effect.id, effect.indistinguishable_from)
+            reason = separating_reason(effect.id, effect.indistinguishable_from)
+            others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
+            return drive, f"These recordings do not distinguish {effect_noun(effect.id)} from {others}. {reason}"
+    advice = diagnosis.advice or (diagnosis.sentence if diagnosis.verdict == "inconclusive" else "")
+    if diagnosis.verdict == "data":
+        return "", advice or "Correct the recording or record again. Then diagnose again."
+    if diagnosis.verdict == "inconclusive":
+        drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
+        own = advice if advice != diagnosis.sentence else ""
+        return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
+    rest = relevant_residual(diagnosis)
+    if (rest is not None or diagnosis.verdict == "unexplained") and not diagnosis.search.covers_catalogue:
+        search = diagnosis.search
+        cut_short = "without a stop" if search.stopped_by == "user" else "with a longer time limit"
+        how = "without --effects" if search.effects else cut_short
+        return "", f"Diagnose these recordings again {how}, before another drive."
+    is_described = remaining_share(diagnosis) < DEFAULT.evidence.unexplained_share_min
+    if rest is not None and not is_described:
+        channels = rest.channels
+        along = bool(channels) and channels[0] in ("x", "vx")
+        motion = "longitudinal" if along else "lateral"
+        return (
+            "coast_down" if along else "steering_chirp",
+            advice or f"The residual is in the {motion} motion. Record a drive that excites it.",
+        )
+    if diagnosis.verdict in ("mismatch", "unexplained"):
+        return "figure_eight", advice or (
+            "The best test of model.toml is a new recording that was neither fitted nor held out here."
+        )
+    return "", advice or "No further drive is needed. Diagnose again when the car, its tyres or the floor change."
+
+
+def drive_command(manoeuvre: str) -> str:
+    """The command line that drives a manoeuvre; empty for none."""
+    return f"carlab drive --policy {manoeuvre} --no-place" if manoeuvre else ""

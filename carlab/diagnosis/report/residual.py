@@ -1,0 +1,44 @@
+"""Shares of the refit's excess, and the residual that a report describes."""
+
+from __future__ import annotations
+
+import math
+
+from carlab.diagnosis.findings import Diagnosis, Unexplained, most_complete
+from carlab.diagnosis.settings import DEFAULT
+
+
+def explained_share(diagnosis: Diagnosis, model: str = "with_effects") -> float:
+    """Share of the refit's squared excess over the noise floor that a model explains, at most 1; NaN if unknown."""
+    held = diagnosis.held_out
+    if "refit" not in held or model not in held or not held["refit"].score > 1.0:
+        return math.nan
+    refit, with_model = (held[name].score ** 2 - 1.0 for name in ("refit", model))
+    return 1.0 - max(with_model, 0.0) / refit
+
+
+def remaining_share(diagnosis: Diagnosis) -> float:
+    """Share of the refit's squared excess that remains with model.toml; NaN if unknown."""
+    return 1.0 - explained_share(diagnosis, most_complete(diagnosis.held_out))
+
+
+def is_above_noise(diagnosis: Diagnosis, model: str) -> bool:
+    """Whether the score of a model is well above the noise floor."""
+    held = diagnosis.held_out.get(model)
+    return held is not None and held.score > DEFAULT.report.score_above_noise
+
+
+def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
+    """The unexplained residual if the report describes it.
+
+    None if its share is small, and if no physics is missing and the refit is near the noise floor.
+    """
+    rest = diagnosis.unexplained
+    if rest is None or rest.share < DEFAULT.evidence.unexplained_share_min:
+        return None
+    if diagnosis.verdict in ("none", "parameters") and not is_above_noise(diagnosis, "refit"):
+        return None
+    return rest
+
+
+__all__ = ["explained_share", "is_above_noise", "relevant_residual", "remaining_share"]
