@@ -107,6 +107,7 @@ class Diagnose:
         from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences, curves_advice
         from carlab.diagnosis.report.drift import drift_sentences
         from carlab.diagnosis.report.events import diagnosed_event_sentences
+        from carlab.diagnosis.report.residual import shown_errors
 
         if diagnosis.data_faults:
             faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in diagnosis.data_faults)
@@ -118,7 +119,7 @@ class Diagnose:
             console.print(f"  {sentence}" if sentence else "", end="\n" if sentence else "")
         for sentence in diagnosed_event_sentences(diagnosis):
             console.print(f"  {sentence}")
-        print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
+        print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", shown_errors(diagnosis))
         if not self.curves and (advice := curves_advice(diagnosis)):
             console.print(advice)
         console.print(

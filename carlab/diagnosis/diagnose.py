@@ -265,6 +265,7 @@ def _assemble_result(
             request.settings.evidence,
         ),
         drift=() if adaptation is None else adaptation.drift,
+        car_file_parameters=_stated_parameters(request.nominal),
         events=recordings.events,
         held_out_with_events=errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )
@@ -272,6 +273,11 @@ def _assemble_result(
     noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
     figure_data = replace(figure_data, noise=noise)
     return Outcome(diagnosis, figure_data, corrected.fit.config, models, held_out.windows)
+
+
+def _stated_parameters(nominal: SimulatorConfig) -> dict[str, float]:
+    """Values of the car file by dotted name, without those that it states as unknown."""
+    return {name: value for name, value in nominal.values().items() if name not in nominal.unknown}
 
 
 __all__ = ["Inconclusive", "Outcome", "Texts", "diagnose"]

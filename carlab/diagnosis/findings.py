@@ -256,7 +256,8 @@ class Diagnosis:
     ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; if uncatalogued physics describes
     the residual also with_uncatalogued_physics, with measured curves also with_curves, with a ceiling also black_box,
     with a discrepancy also with_discrepancy. ``held_out_with_events`` has the same models, scored with the windows that
-    events left out; empty without such windows. ``curve_trial`` is None without measured curves as a stage, and if the
+    events left out; empty without such windows. ``car_file_parameters`` has the value of each of the ``parameters`` in
+    the car file, if it states one. ``curve_trial`` is None without measured curves as a stage, and if the
     user ended it.
     """
 
@@ -277,6 +278,7 @@ class Diagnosis:
     ceiling: Ceiling | None = None
     skill: tuple[Skill, ...] = ()
     drift: tuple[Drift, ...] = ()
+    car_file_parameters: Mapping[str, float] = field(default_factory=dict)
     search: SearchExtent = field(default_factory=SearchExtent)
     events: EventUse = field(default_factory=EventUse)
     held_out_with_events: Mapping[str, FitErrors] = field(default_factory=dict)
@@ -302,7 +304,10 @@ class Diagnosis:
             "sentence": self.sentence,
             "advice": self.advice,
             "effects": effects,
-            "parameters": {name: asdict(e) for name, e in self.parameters.items()},
+            "parameters": {
+                name: {**asdict(e), "car_file": self.car_file_parameters.get(name)}
+                for name, e in self.parameters.items()
+            },
             "fit": {"horizon_s": self.horizon_s, "held_out": {k: asdict(v) for k, v in self.held_out.items()}},
             "unexplained": unexplained,
             "curves": [curve_table(curve) for curve in self.curves],
@@ -360,7 +365,8 @@ class FigureData:
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
-    candidates: candidates for the first effect: id, gain on left-out blocks in standard errors, loss with it
+    candidates: candidates for the first effect: id, gain on left-out blocks in standard errors (NaN without a test),
+                loss with it
     decisions: accepted and rejected effects with statistics and thresholds
     noise: noise of the recordings, for model.toml
     """

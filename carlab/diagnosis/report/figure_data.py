@@ -33,7 +33,7 @@ def figure_data_of(scored: ScoredSearch, recordings: SplitRecordings) -> FigureD
         for name in found.effects[: settings.max_correlations]
     }
     candidates = tuple(
-        (c.effect, c.standard_errors if math.isfinite(c.left_out_gain_error) else 0.0, float(c.fit.loss.sum()))
+        (c.effect, c.standard_errors if c.is_tested else math.nan, float(c.fit.loss.sum()))
         for c in found.first_candidates
     )
     steps = (*scores_by_step(scored), ("noise floor", 1.0))

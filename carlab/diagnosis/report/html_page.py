@@ -16,7 +16,7 @@ from carlab.diagnosis.report.drift import drift_sentences
 from carlab.diagnosis.report.drift_charts import drift_charts
 from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
-from carlab.diagnosis.report.residual import explained_share, relevant_residual
+from carlab.diagnosis.report.residual import explained_share, relevant_residual, shown_errors
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
@@ -73,7 +73,10 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "drive": command,
         "drive_name": drive,
         "why": why.removesuffix(f" Drive it with: {command}"),
-        "parameters": [(name, e, _bar(e)) for name, e in diagnosis.parameters.items()],
+        "held_out": shown_errors(diagnosis),
+        "parameters": [
+            (name, diagnosis.car_file_parameters.get(name), e, _bar(e)) for name, e in diagnosis.parameters.items()
+        ],
         "channels": text.CHANNEL_NAMES,
     }
 
@@ -90,8 +93,8 @@ def _bar(e: Estimate) -> Any:
 def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Scores of the models, for the head of the page."""
     order = ("nominal", "refit", "with_effects", "with_uncatalogued_physics", "with_curves", "noise_floor")
-    shown = [k for k in order if k in diagnosis.held_out and (k != "with_effects" or diagnosis.effects)]
-    return [{"label": figures.LABELS[k], "errors": diagnosis.held_out[k], "style": k} for k in shown]
+    shown = shown_errors(diagnosis)
+    return [{"label": figures.LABELS[k], "errors": shown[k], "style": k} for k in order if k in shown]
 
 
 def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from carlab.diagnosis.findings import Diagnosis, Unexplained, most_complete
+from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, most_complete
 from carlab.diagnosis.settings import DEFAULT
 
 
@@ -20,6 +20,11 @@ def explained_share(diagnosis: Diagnosis, model: str = "with_effects") -> float:
 def remaining_share(diagnosis: Diagnosis) -> float:
     """Share of the refit's squared excess that remains with model.toml; NaN if unknown."""
     return 1.0 - explained_share(diagnosis, most_complete(diagnosis.held_out))
+
+
+def shown_errors(diagnosis: Diagnosis) -> dict[str, FitErrors]:
+    """Held-out errors by model; without named effects, those with effects are those of the refit and are left out."""
+    return {k: v for k, v in diagnosis.held_out.items() if k != "with_effects" or diagnosis.effects}
 
 
 def is_above_noise(diagnosis: Diagnosis, model: str) -> bool:
@@ -41,4 +46,4 @@ def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
     return rest
 
 
-__all__ = ["explained_share", "is_above_noise", "relevant_residual", "remaining_share"]
+__all__ = ["explained_share", "is_above_noise", "relevant_residual", "remaining_share", "shown_errors"]

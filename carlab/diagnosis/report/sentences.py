@@ -16,6 +16,7 @@ from carlab.diagnosis.report.numbers import number as number
 from carlab.diagnosis.report.numbers import percent as percent
 from carlab.diagnosis.report.numbers import unit_text as unit_text
 from carlab.diagnosis.report.numbers import with_unit as with_unit
+from carlab.diagnosis.report.parameters import parameters_at_limit, wrong_parameters
 from carlab.diagnosis.report.residual import explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import DEFAULT
@@ -309,8 +310,9 @@ def _statements(effects: Sequence[EffectFinding]) -> list[str]:
 
 def _parameters(diagnosis: Diagnosis) -> str:
     tail = f" With fitted parameters, {fall}." if (fall := _fall(diagnosis, "nominal", "refit")) else ""
-    text = "No missing physics is found. Parameters of the car file are wrong."
-    return f"{text}{tail}{_warning_above_noise(diagnosis, 'refit')}"
+    which = f": {found}" if (found := wrong_parameters(diagnosis)) else ""
+    text = f"No missing physics is found. Parameters of the car file are wrong{which}."
+    return f"{text}{tail}{parameters_at_limit(diagnosis)}{_warning_above_noise(diagnosis, 'refit')}"
 
 
 def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
@@ -327,7 +329,7 @@ def _none(diagnosis: Diagnosis) -> str:
         return text
     return (
         f"{text} The position error after {with_unit(diagnosis.horizon_s, 's')} is {with_unit(held.position_m, 'm')}; "
-        f"all channels: {number(held.score)} noise floors (1 is the error that measurement noise alone causes)."
+        f"all channels: {number(held.score)} noise floors (a noise floor is the estimated error of measurement noise)."
         f"{_warning_above_noise(diagnosis, 'nominal')}"
     )
 

@@ -21,6 +21,8 @@ class ReportSettings:
     """Maximum number of effects with a figure of their cross-correlation."""
     max_candidates: int = 12
     """Maximum number of rows in the table of candidate effects."""
+    max_wrong_parameters: int = 3
+    """Maximum number of parameters of the car file that the verdict sentence names."""
     max_picture_names: int = 5
     """Maximum number of effects in the title of summary.png."""
     correlation_step_s: float = 0.2

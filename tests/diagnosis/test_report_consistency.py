@@ -1,20 +1,25 @@
-"""What a report says about the residual, and about model.toml, agrees with its errors."""
+"""What a report says about the residual, the parameters and model.toml agrees with its numbers."""
 
 import html
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from carlab.diagnosis.final_models import measured_curves
-from carlab.diagnosis.findings import CurveTrial, Diagnosis, FigureData, FitErrors, SearchExtent, Unexplained
+from carlab.diagnosis.findings import CurveTrial, Diagnosis, Estimate, FigureData, FitErrors, SearchExtent, Unexplained
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.report.curves import curves_advice
+from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.next_drive import next_drive
+from carlab.diagnosis.report.residual import shown_errors
 from carlab.diagnosis.report.sentences import verdict_sentence
 from carlab.diagnosis.report.write import completed
-from carlab.diagnosis.selection.problem import RunControl
+from carlab.diagnosis.selection.problem import Candidate, RunControl
 from carlab.diagnosis.settings import DEFAULT
+from sim_backends import SimulatorConfig
 from tests.diagnosis.report_material import lag_finding
 
 REST = Unexplained(1.0, ("vx",), "speed > 1 m/s", "odd in speed", "coast_brake: coefficient 1 N s/m")
@@ -92,3 +97,58 @@ def test_small_share_of_a_large_excess_is_stated_as_an_error_above_the_noise() -
 
 def test_page_states_the_next_command_once() -> None:
     assert page(diagnosis("unexplained", 13.2)).count("carlab drive --policy coast_down") == 1
+
+
+def test_scores_below_the_noise_floor_are_not_denied() -> None:
+    """The noise floor is an estimate: a simulator without an error can have a score of 0.7."""
+    good = replace(diagnosis("none", 0.74), unexplained=None)
+    assert "the best score is 1" not in page(good)
+    assert "0.74 noise floors (a noise floor is the estimated error of measurement noise)" in verdict_sentence(good)
+
+
+def test_model_without_named_effects_has_no_row_of_its_own() -> None:
+    assert "with_effects" not in shown_errors(diagnosis("none", 1.0))
+    assert "with_effects" in shown_errors(diagnosis("mismatch", 4.0))
+    assert "<td>with effects</td>" not in page(diagnosis("none", 1.0))
+
+
+def test_verdict_names_the_parameters_that_are_most_wrong_and_those_at_a_limit() -> None:
+    fitted = {
+        "vehicle.mass": Estimate(1.65, 0.006, 1.64, 1.66, "kg"),
+        "vehicle.yaw_inertia": Estimate(0.0722, 0.0004, 0.0716, 0.0728, "kg m2"),
+        "motor.drive_gain": Estimate(6.82, 0.02, 6.79, 6.86, "N"),
+        "motor.damping": Estimate(1.57, 0.005, 1.565, 1.575, "N s/m"),
+        "tyre.front.B": Estimate(2.9, 0.01, 2.88, 2.92, "1/rad"),
+        "tyre.rear.mu": Estimate(0.45, 0.001, 0.449, 0.45, "1", at_limit=True),
+    }
+    stated = {
+        "vehicle.mass": 1.65, "vehicle.yaw_inertia": 0.06, "motor.drive_gain": 8.2, "motor.damping": 1.56,
+        "tyre.front.B": 2.75,
+    }  # fmt: skip
+    case = replace(diagnosis("parameters", 1.0), parameters=fitted, car_file_parameters=stated)
+    sentence = verdict_sentence(case)
+    assert (
+        "Parameters of the car file are wrong: motor.drive_gain is 6.82 N (car file: 8.2 N), vehicle.yaw_inertia is "
+        "0.0722 kg m² (car file: 0.06 kg m²), tyre.front.B is 2.9 1/rad (car file: 2.75 1/rad) and 1 more differs."
+        in sentence
+    )
+    assert "tyre.rear.mu ends at the limit of the range in the car file; widen it and diagnose again." in sentence
+    assert case.to_dict()["parameters"]["motor.drive_gain"]["car_file"] == 8.2
+    assert '<th class="n">car file</th>' in page(case)
+
+
+def test_candidate_without_a_test_has_no_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page has no row for it; a gain of 0 would rank before candidates that were tested and failed."""
+    for name, value in (("_traces", ()), ("_regimes", {}), ("scores_by_step", ())):
+        monkeypatch.setattr(f"carlab.diagnosis.report.figure_data.{name}", lambda *arguments, value=value: value)
+    fit = Fit(SimulatorConfig(), (), np.zeros(0), 0.0, np.zeros(3))
+    untested = Candidate("motor_lag", fit, 5.0)
+    failed = replace(untested, effect="road_slope", left_out_gain=-2.0, left_out_gain_error=1.0, left_out_loss=fit.loss)
+    found = SimpleNamespace(effects=(), first_candidates=(untested, failed))
+    scored = SimpleNamespace(found=found, problem=SimpleNamespace(settings=DEFAULT))
+    figure_data = figure_data_of(scored, None)  # type: ignore[arg-type]
+    assert np.isnan(figure_data.candidates[0][1])
+    assert figure_data.candidates[1][1] == -2.0
+    shown = html.unescape(render_page(diagnosis("none", 1.0), figure_data))
+    assert "road_slope" in shown
+    assert "motor_lag" not in shown
