@@ -188,8 +188,9 @@ def test_readings_of_the_car_file_itself_are_empty(outcome):
     axes = EFFECTS["drive_map"].axes
     throttle, speed = np.meshgrid(*(a.knots for a in axes), indexing="ij")
     same = finding(5.0 * throttle - speed)
-    held = [s for s in readings_of_drive(same, DEFAULT.report) if "brakes" in s or "saturates" in s]
-    assert held == []
+    assert readings_of_drive(same, DEFAULT.report) == []
+    braking = finding(5.0 * throttle - speed - 0.6 * speed * (throttle == 0.0))  # a motor that brakes while coasting
+    assert [s.partition(",")[0] for s in readings_of_drive(braking, DEFAULT.report)] == ["With the throttle released"]
     assert curve_sentences(replace(outcome.diagnosis, curves=())) == []
 
 
@@ -280,7 +281,7 @@ def test_verdict_states_the_error_with_measured_curves(outcome):
 
     found = outcome.diagnosis.held_out["with_curves"]
     assert (
-        f"the held-out error is {with_unit(found.position_m, 'm')} ({number(found.score)} noise floors)"
+        f"position error is {with_unit(found.position_m, 'm')} (all channels: {number(found.score)} noise floors)"
         in verdict_sentence(outcome.diagnosis)
     )
     assert "measured curve" not in verdict_sentence(replace(outcome.diagnosis, curves=()))

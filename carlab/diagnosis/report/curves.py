@@ -148,7 +148,8 @@ def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str
             f"{number(float(speed[moving].max()))} m/s (car file: {number(float(own.min()))} to "
             f"{number(float(own.max()))} m/s²)."
         )
-    held = [(u, v) for u, row in zip(throttle, curve.measured, strict=True) if u > 0.0 if (v := _zero(speed, row))]
+    rows = zip(throttle, curve.measured, curve.car_file, strict=True)
+    held = [(u, v) for u, row, base in rows if u > 0.0 and (v := _held_speed(speed, row, base, settings))]
     if len(held) >= 2 and all(a[1] < b[1] for a, b in itertools.pairwise(held)):
         pairs = ", ".join(f"{number(v)} m/s at throttle {number(u)}" for u, v in held)
         found.append(f"The motor holds a speed rather than a force: {pairs}.")
@@ -161,12 +162,19 @@ def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str
     return found
 
 
-def _zero(speed: FloatArray, row: FloatArray) -> float | None:
-    """Speed above 0 at which an acceleration falls through 0; None without a crossing between knots with data."""
+def _held_speed(
+    speed: FloatArray, measured: FloatArray, car_file: FloatArray, settings: ReportSettings
+) -> float | None:
+    """Speed above 0 at which a controller holds the car; None without one between knots with data.
+
+    The acceleration falls through 0 there, several times as steeply as that of the car file: any motor with damping has
+    a speed without acceleration.
+    """
     for k in range(len(speed) - 1):
-        before, after = row[k], row[k + 1]
+        before, after = measured[k], measured[k + 1]
         if speed[k] >= 0.0 and np.isfinite(before) and np.isfinite(after) and before > 0.0 >= after:
-            return float(speed[k] + (speed[k + 1] - speed[k]) * before / (before - after))
+            is_steep = before - after > settings.holding_slope_ratio * (car_file[k] - car_file[k + 1])
+            return float(speed[k] + (speed[k + 1] - speed[k]) * before / (before - after)) if is_steep else None
     return None
 
 

@@ -13,6 +13,8 @@ class ReportSettings:
     """Minimum difference from the car file's curve at each knot of a reading [standard deviations]."""
     saturation_share: float = 0.3
     """A drive force saturates if it grows by less than this share of the car file's growth."""
+    holding_slope_ratio: float = 2.0
+    """A motor holds a speed if its acceleration falls there this many times as steeply as that of the car file."""
     score_above_noise: float = 1.5
     """Score (noise floors) above which a verdict without missing physics has a warning."""
     max_traces: int = 3
