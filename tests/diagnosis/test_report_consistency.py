@@ -15,7 +15,7 @@ from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.next_drive import next_drive
 from carlab.diagnosis.report.residual import shown_errors
-from carlab.diagnosis.report.sentences import verdict_sentence
+from carlab.diagnosis.report.sentences import regime_clause, verdict_sentence
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.selection.problem import Candidate, RunControl
 from carlab.diagnosis.settings import DEFAULT
@@ -123,7 +123,7 @@ def test_verdict_names_the_parameters_that_are_most_wrong_and_those_at_a_limit()
     }
     stated = {
         "vehicle.mass": 1.65, "vehicle.yaw_inertia": 0.06, "motor.drive_gain": 8.2, "motor.damping": 1.56,
-        "tyre.front.B": 2.75,
+        "tyre.front.B": 2.75, "tyre.rear.mu": 0.42,
     }  # fmt: skip
     case = replace(diagnosis("parameters", 1.0), parameters=fitted, car_file_parameters=stated)
     sentence = verdict_sentence(case)
@@ -152,3 +152,7 @@ def test_candidate_without_a_test_has_no_gain(monkeypatch: pytest.MonkeyPatch) -
     shown = html.unescape(render_page(diagnosis("none", 1.0), figure_data))
     assert "road_slope" in shown
     assert "motor_lag" not in shown
+
+
+def test_unit_of_a_regime_has_superscripts_as_elsewhere() -> None:
+    assert regime_clause("lateral acceleration > 2 m/s2") == "mostly where lateral acceleration > 2 m/s²"

@@ -8,11 +8,15 @@ from carlab.diagnosis.settings import DEFAULT
 
 
 def wrong_parameters(diagnosis: Diagnosis) -> str:
-    """The parameters that differ most from the car file, in standard deviations; empty if the car file states none."""
+    """The parameters that differ most from the car file, in standard deviations; empty without any.
+
+    Those at the limit of their range are left out: their standard deviations are too small.
+    """
     differences = {
         name: abs(e.value - diagnosis.car_file_parameters[name]) / max(e.std, 1e-12)
         for name, e in diagnosis.parameters.items()
-        if name in diagnosis.car_file_parameters and not e.low90 <= diagnosis.car_file_parameters[name] <= e.high90
+        if name in diagnosis.car_file_parameters
+        and not (e.at_limit or e.low90 <= diagnosis.car_file_parameters[name] <= e.high90)
     }
     largest = sorted(differences, key=lambda name: -differences[name])
     shown = largest[: DEFAULT.report.max_wrong_parameters]

@@ -363,7 +363,7 @@ def _inconclusive(diagnosis: Diagnosis) -> str:
 
 
 def regime_clause(regime: str) -> str:
-    """A regime as a clause: ``mostly where speed > 2 m/s``."""
+    """A regime as a clause: ``mostly where lateral acceleration > 2 m/s²``."""
     if not regime or regime == "everywhere alike":
         return "equally in all driving conditions"
-    return f"mostly where {regime}"
+    return f"mostly where {unit_text(regime)}"
