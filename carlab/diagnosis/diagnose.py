@@ -24,6 +24,7 @@ from carlab.diagnosis.final_models import (
     adapted,
     ceiling_by_networks,
     errors_with_events,
+    fitted_score,
     measured_curves,
     trained_models,
 )
@@ -258,6 +259,7 @@ def _assemble_result(
         curves=() if measured is None else curve_findings(measured, request.nominal, segments, settings),
         curve_trial=curve_trial,
         ceiling=ceiling_by_networks(held_out_errors),
+        fitted_score=fitted_score(scored, recordings, request),
         skill=skill_of(
             held_out.windows,
             final_errors[most_complete(final_errors)],

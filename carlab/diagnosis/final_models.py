@@ -42,6 +42,12 @@ class Request:
     keep_events: bool
 
 
+def fitted_score(scored: ScoredSearch, recordings: SplitRecordings, request: Request) -> float:
+    """Score [noise floors] of the model with effects at the end of the windows that were fitted."""
+    fitted = HeldOut.of(recordings.fit_windows, scored.held_out.noise, request.nominal, request.settings.identification)
+    return fitted.score(fitted.final_error(scored.found.best.config))
+
+
 def errors_with_events(
     models: Mapping[str, PredictiveModel],
     errors: Mapping[str, FloatArray],
@@ -153,4 +159,12 @@ def ceiling_by_networks(errors: Mapping[str, FitErrors]) -> Ceiling | None:
     return ceiling_of(errors["refit"].score, errors[most_complete(errors)].score, min(networks))
 
 
-__all__ = ["Request", "adapted", "ceiling_by_networks", "errors_with_events", "measured_curves", "trained_models"]
+__all__ = [
+    "Request",
+    "adapted",
+    "ceiling_by_networks",
+    "errors_with_events",
+    "fitted_score",
+    "measured_curves",
+    "trained_models",
+]

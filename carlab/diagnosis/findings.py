@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -256,7 +257,8 @@ class Diagnosis:
     ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; if uncatalogued physics describes
     the residual also with_uncatalogued_physics, with measured curves also with_curves, with a ceiling also black_box,
     with a discrepancy also with_discrepancy. ``held_out_with_events`` has the same models, scored with the windows that
-    events left out; empty without such windows. ``car_file_parameters`` has the value of each of the ``parameters`` in
+    events left out; empty without such windows. ``fitted_score`` is that of with_effects on the windows that were
+    fitted; NaN if unknown. ``car_file_parameters`` has the value of each of the ``parameters`` in
     the car file, if it states one. ``curve_trial`` is None without measured curves as a stage, and if the
     user ended it.
     """
@@ -276,6 +278,7 @@ class Diagnosis:
     curves: tuple[CurveFinding, ...] = ()
     curve_trial: CurveTrial | None = None
     ceiling: Ceiling | None = None
+    fitted_score: float = math.nan
     skill: tuple[Skill, ...] = ()
     drift: tuple[Drift, ...] = ()
     car_file_parameters: Mapping[str, float] = field(default_factory=dict)
@@ -308,7 +311,11 @@ class Diagnosis:
                 name: {**asdict(e), "car_file": self.car_file_parameters.get(name)}
                 for name, e in self.parameters.items()
             },
-            "fit": {"horizon_s": self.horizon_s, "held_out": {k: asdict(v) for k, v in self.held_out.items()}},
+            "fit": {
+                "horizon_s": self.horizon_s,
+                "fitted_score": self.fitted_score,
+                "held_out": {k: asdict(v) for k, v in self.held_out.items()},
+            },
             "unexplained": unexplained,
             "curves": [curve_table(curve) for curve in self.curves],
             "curve_trial": None if self.curve_trial is None else asdict(self.curve_trial),

@@ -15,7 +15,7 @@ from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.next_drive import next_drive
 from carlab.diagnosis.report.residual import shown_errors
-from carlab.diagnosis.report.sentences import regime_clause, verdict_sentence
+from carlab.diagnosis.report.sentences import regime_clause, verdict_sentence, verdict_title
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.selection.problem import Candidate, RunControl
 from carlab.diagnosis.settings import DEFAULT
@@ -156,3 +156,20 @@ def test_candidate_without_a_test_has_no_gain(monkeypatch: pytest.MonkeyPatch) -
 
 def test_unit_of_a_regime_has_superscripts_as_elsewhere() -> None:
     assert regime_clause("lateral acceleration > 2 m/s2") == "mostly where lateral acceleration > 2 m/s²"
+
+
+def test_car_that_changed_before_the_held_out_recordings_is_not_missing_physics() -> None:
+    changed = replace(diagnosis("unexplained", 12.9), fitted_score=0.8)
+    sentence = verdict_sentence(changed)
+    assert sentence.startswith(
+        "The refitted simulator agrees with the fitted recordings (0.8 noise floors) but not with the held-out ones "
+        "(12.9 noise floors, 0.0258 m after 1 s)."
+    )
+    assert verdict_title(changed) == "The held-out recordings differ from the fitted ones"
+    assert "carlab compare" in next_drive(changed)[1]
+    assert curves_advice(changed) == ""
+    shown = page(changed)
+    assert "odd in speed" not in shown
+    lacking = replace(changed, fitted_score=9.0)
+    assert verdict_sentence(lacking).startswith("The simulator lacks physics")
+    assert verdict_title(lacking) == "Physics outside the catalogue is missing"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis
 from carlab.diagnosis.report.numbers import listed
-from carlab.diagnosis.report.residual import relevant_residual, remaining_share
+from carlab.diagnosis.report.residual import differs_when_held_out, relevant_residual, remaining_share
 from carlab.diagnosis.report.sentences import effect_noun, separating_drive, separating_reason
 from carlab.diagnosis.settings import DEFAULT
 
@@ -26,6 +26,11 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
         drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
         own = advice if advice != diagnosis.sentence else ""
         return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
+    if differs_when_held_out(diagnosis):
+        return "", (
+            "Compare both groups with carlab compare, which names what changed (50 s of driving in each group), or "
+            "diagnose recordings of both together."
+        )
     rest = relevant_residual(diagnosis)
     if (rest is not None or diagnosis.verdict == "unexplained") and not diagnosis.search.covers_catalogue:
         search = diagnosis.search

@@ -33,17 +33,30 @@ def is_above_noise(diagnosis: Diagnosis, model: str) -> bool:
     return held is not None and held.score > DEFAULT.report.score_above_noise
 
 
+def differs_when_held_out(diagnosis: Diagnosis) -> bool:
+    """Whether a model without effects explains the fitted recordings, but not the held-out ones."""
+    return diagnosis.verdict == "unexplained" and diagnosis.fitted_score < DEFAULT.evidence.unexplained_score_min
+
+
 def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
     """The unexplained residual if the report describes it.
 
-    None if its share is small, and if no physics is missing and the refit is near the noise floor.
+    None if its share is small, if no physics is missing and the refit is near the noise floor, and if only held-out
+    recordings have it.
     """
     rest = diagnosis.unexplained
-    if rest is None or rest.share < DEFAULT.evidence.unexplained_share_min:
+    if rest is None or rest.share < DEFAULT.evidence.unexplained_share_min or differs_when_held_out(diagnosis):
         return None
     if diagnosis.verdict in ("none", "parameters") and not is_above_noise(diagnosis, "refit"):
         return None
     return rest
 
 
-__all__ = ["explained_share", "is_above_noise", "relevant_residual", "remaining_share", "shown_errors"]
+__all__ = [
+    "differs_when_held_out",
+    "explained_share",
+    "is_above_noise",
+    "relevant_residual",
+    "remaining_share",
+    "shown_errors",
+]

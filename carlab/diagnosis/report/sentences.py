@@ -17,7 +17,7 @@ from carlab.diagnosis.report.numbers import percent as percent
 from carlab.diagnosis.report.numbers import unit_text as unit_text
 from carlab.diagnosis.report.numbers import with_unit as with_unit
 from carlab.diagnosis.report.parameters import parameters_at_limit, wrong_parameters
-from carlab.diagnosis.report.residual import explained_share, is_above_noise, relevant_residual
+from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
@@ -175,6 +175,8 @@ def verdict_title(diagnosis: Diagnosis) -> str:
         return "Missing physics is found, with more than one possible name"
     if diagnosis.effects and all(effect.car_file_values for effect in diagnosis.effects):
         return "Effects of the car file have wrong numbers"
+    if differs_when_held_out(diagnosis):
+        return "The held-out recordings differ from the fitted ones"
     if diagnosis.verdict == "unexplained" and not diagnosis.search.covers_catalogue:
         return "Missing physics is found, but not named"
     return VERDICT_TITLES[diagnosis.verdict]
@@ -341,6 +343,8 @@ def _data(diagnosis: Diagnosis) -> str:
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
+    if differs_when_held_out(diagnosis):
+        return _different_when_held_out(diagnosis)
     rest = diagnosis.unexplained
     text = "The simulator lacks physics that no effect of the catalogue explains"
     if diagnosis.search.effects:
@@ -355,6 +359,16 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     if not diagnosis.search.is_complete:
         return sentence
     return f"{sentence} Class of the missing physics: {rest.kind or 'unknown'}."
+
+
+def _different_when_held_out(diagnosis: Diagnosis) -> str:
+    held = diagnosis.held_out["refit"]
+    return (
+        f"The refitted simulator agrees with the fitted recordings ({number(diagnosis.fitted_score)} noise floors) but "
+        f"not with the held-out ones ({number(held.score)} noise floors, {with_unit(held.position_m, 'm')} after "
+        f"{with_unit(diagnosis.horizon_s, 's')}). The car or the motion capture changed between them, or the held-out "
+        "recordings have conditions that the fitted ones lack."
+    )
 
 
 def _inconclusive(diagnosis: Diagnosis) -> str:
