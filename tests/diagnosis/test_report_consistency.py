@@ -10,17 +10,17 @@ import pytest
 from carlab.diagnosis.final_models import measured_curves
 from carlab.diagnosis.findings import CurveTrial, Diagnosis, Estimate, FigureData, FitErrors, SearchExtent, Unexplained
 from carlab.diagnosis.identification.fit import Fit
-from carlab.diagnosis.report.curves import curves_advice
+from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
 from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.next_drive import next_drive
 from carlab.diagnosis.report.residual import shown_errors
 from carlab.diagnosis.report.sentences import regime_clause, verdict_sentence, verdict_title
-from carlab.diagnosis.report.write import completed
+from carlab.diagnosis.report.write import completed, model_toml
 from carlab.diagnosis.selection.problem import Candidate, RunControl
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends import SimulatorConfig
-from tests.diagnosis.report_material import lag_finding
+from tests.diagnosis.report_material import inconclusive, lag_finding
 
 REST = Unexplained(1.0, ("vx",), "speed > 1 m/s", "odd in speed", "coast_brake: coefficient 1 N s/m")
 
@@ -173,3 +173,26 @@ def test_car_that_changed_before_the_held_out_recordings_is_not_missing_physics(
     lacking = replace(changed, fitted_score=9.0)
     assert verdict_sentence(lacking).startswith("The simulator lacks physics")
     assert verdict_title(lacking) == "Physics outside the catalogue is missing"
+
+
+def test_physics_of_the_fitted_recordings_alone_is_not_denied() -> None:
+    mixed = replace(diagnosis("none", 0.8), unexplained=None, fitted_score=12.6)
+    assert "On the fitted recordings, the error of the refit is 12.6 noise floors" in verdict_sentence(mixed)
+    assert "On the fitted recordings" not in verdict_sentence(replace(mixed, fitted_score=1.1))
+    assert "On the fitted recordings" in verdict_sentence(replace(mixed, verdict="parameters"))
+
+
+def test_ceiling_without_an_excess_has_a_sentence() -> None:
+    without = diagnosis("none", 0.8, black_box=16.0)
+    assert ceiling_sentence(without) == "The refit has no error above the noise floor, so nothing is left to predict."
+    assert ceiling_sentence(diagnosis("none", 0.8)) == ""
+
+
+def test_report_without_a_fit_advises_a_drive_and_names_the_car_file_as_given() -> None:
+    short = "The recordings to fit contain 2 s of driving."
+    undecided = replace(inconclusive(), sentence=short, advice=short)
+    assert next_drive(undecided) == ("excitation", "Diagnose this drive together with these recordings.")
+    assert "the car file as given" in page(undecided)
+    text = model_toml(undecided, SimulatorConfig(), None)
+    assert "# Not fitted: the car file as given." in text
+    assert "# Fitted to" not in text

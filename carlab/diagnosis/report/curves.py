@@ -87,7 +87,8 @@ def ceiling_sentence(diagnosis: Diagnosis) -> str:
     """How much of the excess is explained, can be explained and cannot; empty without networks."""
     ceiling = diagnosis.ceiling
     if ceiling is None:
-        return ""
+        has_networks = not {"black_box", "with_discrepancy"}.isdisjoint(diagnosis.held_out)
+        return "The refit has no error above the noise floor, so nothing is left to predict." if has_networks else ""
     shares = (
         f"The model explains {percent(ceiling.by_model)} of the refit's squared excess over the noise floor. Networks "
         f"predict another {percent(ceiling.predictable)} from past commands and velocities. Neither predicts the "

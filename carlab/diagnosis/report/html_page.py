@@ -64,6 +64,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),
+        "min_windows": DEFAULT.evidence.skill_windows_min,
         "drift": [(d, drift_charts(d)) for d in diagnosis.drift],
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),

@@ -23,9 +23,9 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.verdict == "data":
         return "", advice or "Correct the recording or record again. Then diagnose again."
     if diagnosis.verdict == "inconclusive":
-        drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
+        drive = next((m for m in MANOEUVRES if m in advice), "excitation")
         own = advice if advice != diagnosis.sentence else ""
-        return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
+        return drive, own or "Diagnose this drive together with these recordings."
     if differs_when_held_out(diagnosis):
         return "", (
             "Compare both groups with carlab compare, which names what changed (50 s of driving in each group), or "

@@ -314,7 +314,8 @@ def _parameters(diagnosis: Diagnosis) -> str:
     tail = f" With fitted parameters, {fall}." if (fall := _fall(diagnosis, "nominal", "refit")) else ""
     which = f": {found}" if (found := wrong_parameters(diagnosis)) else ""
     text = f"No missing physics is found. Parameters of the car file are wrong{which}."
-    return f"{text}{tail}{parameters_at_limit(diagnosis)}{_warning_above_noise(diagnosis, 'refit')}"
+    warnings = f"{_warning_above_noise(diagnosis, 'refit')}{_warning_of_fitted(diagnosis)}"
+    return f"{text}{tail}{parameters_at_limit(diagnosis)}{warnings}"
 
 
 def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
@@ -322,6 +323,16 @@ def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
     if not is_above_noise(diagnosis, which):
         return ""
     return " This error is above the noise: the simulator lacks physics that the diagnosis does not find."
+
+
+def _warning_of_fitted(diagnosis: Diagnosis) -> str:
+    """A warning if only the fitted recordings have an error well above the noise; else empty."""
+    if is_above_noise(diagnosis, "refit") or not diagnosis.fitted_score > DEFAULT.report.score_above_noise:
+        return ""
+    return (
+        f" On the fitted recordings, the error of the refit is {number(diagnosis.fitted_score)} noise floors: they "
+        "show physics that the held-out recordings do not. Diagnose drives of each kind by themselves."
+    )
 
 
 def _none(diagnosis: Diagnosis) -> str:
@@ -332,7 +343,7 @@ def _none(diagnosis: Diagnosis) -> str:
     return (
         f"{text} The position error after {with_unit(diagnosis.horizon_s, 's')} is {with_unit(held.position_m, 'm')}; "
         f"all channels: {number(held.score)} noise floors (a noise floor is the estimated error of measurement noise)."
-        f"{_warning_above_noise(diagnosis, 'nominal')}"
+        f"{_warning_above_noise(diagnosis, 'nominal')}{_warning_of_fitted(diagnosis)}"
     )
 
 

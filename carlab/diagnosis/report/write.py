@@ -93,7 +93,7 @@ def completed(diagnosis: Diagnosis) -> Diagnosis:
 
 def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoise | None) -> str:
     """The simulator as a car file with the noise of the recordings; comments state the origin of its numbers."""
-    fitted = [use.path for use in diagnosis.recordings if use.role == "fit"]
+    fitted = [use.path for use in diagnosis.recordings if use.role == "fit" and diagnosis.parameters]
     found = text.listed([effect.id for effect in diagnosis.effects])
     held = diagnosis.held_out
     lines = ["Car file written by carlab diagnose; use it with --car, or diagnose again from it."]
