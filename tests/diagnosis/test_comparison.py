@@ -145,7 +145,7 @@ def test_verb_writes_the_result_of_the_call(first, tmp_path, capsys):
     paths = csv_files(tmp_path, first, second(CAR))
     arguments = ["compare", str(paths[0]), "--with", str(paths[1]), "--candidates", "motor_lag", "steering_offset"]
     assert run([*arguments, "--out", str(tmp_path / "out")]) == 0
-    assert "These recordings show no change" in capsys.readouterr().out
+    assert "No effect or parameter of the simulator changed significantly" in capsys.readouterr().out
     saved = json.loads((tmp_path / "out" / "compare.json").read_text(encoding="utf-8"))
     assert saved["schema"] == "carlab.compare/1"
     assert saved["verdict"] == "nothing"

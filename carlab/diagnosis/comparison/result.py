@@ -98,7 +98,7 @@ def verdict_sentence(verdict: ComparisonVerdict, changes: Sequence[Change], *, i
     if verdict == "inconclusive":
         return "The comparison was stopped before it found a change. Compare again for a result."
     if not changes:
-        return "These recordings show no change of the car between the two groups."
+        return "No effect or parameter of the simulator changed significantly between the two groups."
     falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
     names = listed([c.name for c in changes])
     text = f"Between the two groups changed: {names}. This lowers the loss of the second group by {falls}."
