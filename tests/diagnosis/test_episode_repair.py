@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
+from carlab.diagnosis.recording_faults.find import check
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -27,3 +28,15 @@ def test_poses_of_another_rate_stay_as_they_are() -> None:
     repair = EpisodeRepair.of(replace(true, poses=poses))
     repair.trim(1, at_end=True)
     np.testing.assert_array_equal(repair.result().poses, poses)
+
+
+def test_one_wrong_pose_is_described_in_the_singular() -> None:
+    car = SimulatorConfig(control_period_s=PERIOD_S)
+    true = drive(car, 20.0, 1)
+    states = true.states.copy()
+    states[300, 0] += 0.4
+    _, _, (fault,) = check([replace(true, states=states)], [], car)
+    assert fault.action == (
+        "repaired: the pose of 1 row is far from the path of its neighbours (another marker, a bad frame); 1 was "
+        "interpolated from its neighbours."
+    )

@@ -96,7 +96,8 @@ def _check_outliers(repair: EpisodeRepair) -> None:
     outliers = rows_off_path(repair.times_s, repair.states[:, :3])
     if outliers.any():
         count = int(outliers.sum())
-        observation = f"the pose of {count} rows is far from their neighbours' path (another marker, a bad frame)"
+        rows = "1 row is far from the path of its" if count == 1 else f"{count} rows is far from the path of their"
+        observation = f"the pose of {rows} neighbours (another marker, a bad frame)"
         remedy = _interpolate(repair, outliers, columns=3)
         repair.repaired(Fault("outliers", "x, y, yaw", observation), remedy, count)
     repair.cut_at_jumps()
@@ -152,4 +153,6 @@ def _interpolate(repair: EpisodeRepair, bad: BoolArray, *, columns: int) -> str:
     if np.isnan(states).any():
         repair.keep(np.asarray(np.isfinite(states).all(axis=1)))
     removed = int(bad.sum()) - count
-    return f"{count} were interpolated from their neighbours" + (f", {removed} were removed" if removed else "")
+    how = "1 was interpolated from its" if count == 1 else f"{count} were interpolated from their"
+    removal = f", {removed} {'was' if removed == 1 else 'were'} removed" if removed else ""
+    return f"{how} neighbours{removal}"
