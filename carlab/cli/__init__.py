@@ -86,8 +86,7 @@ def run(argv: Sequence[str]) -> int:
         fail(" ".join(("Interrupted.", *getattr(error, "__notes__", ()))))
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        raise
     except OSError as error:
         from carlab.recording.sink import DISK_FULL, describe_os_error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from carlab.cli.exit_codes import EXIT_BROKEN_PIPE
 from carlab.core.quantities import Reality
 
 FILE_WIDTH_CHARS = 140
@@ -22,10 +24,18 @@ PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
 """Packages of the program, whose logs ``--verbose`` shows."""
 
 
+class _Console(Console):
+    """A console that ends the program with exit code 141 if the reader of its pipe has ended."""
+
+    def on_broken_pipe(self) -> None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(EXIT_BROKEN_PIPE)
+
+
 def _console(*, stderr: bool) -> Console:
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
     # Without markup: a file name such as drive[v2].mcap would lose its brackets.
-    return Console(stderr=stderr, highlight=False, markup=False, width=None if terminal else FILE_WIDTH_CHARS)
+    return _Console(stderr=stderr, highlight=False, markup=False, width=None if terminal else FILE_WIDTH_CHARS)
 
 
 console = _console(stderr=False)

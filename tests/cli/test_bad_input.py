@@ -274,13 +274,14 @@ def test_unfinished_recording_is_named_by_import_and_view(carlab: Carlab, tmp_pa
     assert code == 0, text
 
 
-def test_closed_pipe_ends_the_program_without_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_closed_pipe_ends_the_program_without_a_traceback(option: str, monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, "w") as closed_pipe:
         monkeypatch.setattr(sys, "stdout", closed_pipe)
         with pytest.raises(SystemExit) as end:
-            cli.main(["--help"])
+            cli.main([option])
     assert end.value.code == 141
 
 
