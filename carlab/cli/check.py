@@ -8,11 +8,9 @@ from rich.text import Text
 from tyro.conf import OmitArgPrefixes
 
 from carlab.api.runs import RunHooks
-from carlab.cli.console import banner, console, fail, table
+from carlab.cli.console import banner, console, fail, readings_table, table
 from carlab.cli.options import CarOptions, TaskOptions, arguments_of
 from carlab.core.errors import NotReadyError
-
-UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}
 
 
 @dataclass
@@ -45,9 +43,8 @@ class Check:
         result = check(**arguments_of(self, check), hooks=hooks)
         if self.task.to_text():
             console.print("No error found in the task.")
-        if readings := result.health.readings:
-            rows = [[_label(name), f"{value:.4g}", _unit(name)] for name, value in readings.items()]
-            table("Readings", ["reading", "value", "unit"], rows)
+        if result.health.readings:
+            readings_table("Readings", result.health.readings)
         if result.latency is not None and result.latency.parts:
             lines = [
                 [name, *(f"{ms:z.2f}" for ms in (p50, p99, top)), str(count)]
@@ -58,12 +55,3 @@ class Check:
             fail(problem)
         console.print(Text("Ready.", "green") if result.is_ready else Text("Not ready.", "red"))
         return 0 if result.is_ready else NotReadyError.exit_code
-
-
-def _unit(name: str) -> str:
-    return UNITS.get(name.rpartition("_")[2], "")
-
-
-def _label(name: str) -> str:
-    stem, _, unit = name.rpartition("_")
-    return (stem if unit in UNITS and stem else name).replace("_", " ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rich import box
@@ -22,6 +22,8 @@ from carlab.core.quantities import Reality
 FILE_WIDTH_CHARS = 140
 PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
 """Packages of the program, whose logs ``--verbose`` shows."""
+UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}
+"""Last parts of the names of readings, and their symbols."""
 
 
 class _Console(Console):
@@ -81,6 +83,16 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
     if title:
         console.print()
     console.print(rich_table)
+
+
+def readings_table(title: str, readings: Mapping[str, float]) -> None:
+    """Print readings, whose names end in their unit, in a table."""
+    rows = []
+    for name, value in readings.items():
+        stem, _, unit = name.rpartition("_")
+        label, symbol = (stem, UNITS[unit]) if stem and unit in UNITS else (name, "")
+        rows.append([label.replace("_", " "), f"{value:.4g}", symbol])
+    table(title, ["reading", "value", "unit"], rows)
 
 
 @contextmanager

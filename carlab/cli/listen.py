@@ -9,7 +9,7 @@ from typing import Literal
 from rich.text import Text
 
 from carlab.api.arguments import above_zero
-from carlab.cli.console import console, fail, table
+from carlab.cli.console import console, fail, readings_table
 from carlab.cli.options import arguments_of
 from carlab.core.errors import ConfigError
 
@@ -90,8 +90,7 @@ class Listen:
                 shown.update(problems)
                 clock.sleep_until(min(clock.now_s() + 0.25, end_s))
             statistics, problems = source.statistics(), source.problems()
-        rows = [[name.replace("_", " "), f"{value:.4g}"] for name, value in statistics.items()]
-        table("Stream", ["figure", "value"], rows)
+        readings_table("Stream", statistics)
         for problem in problems:
             fail(problem)
         return 0

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import socket
 import sys
 from collections.abc import Callable
@@ -108,6 +109,7 @@ def test_malformed_frames_are_counted_and_ignored(carlab: Carlab, tmp_path: Path
         code, text = carlab("listen", "--car", path, "--seconds", "0.8")
     assert code == 0
     assert "malformed" in text
+    assert re.search(r"rate +[\d.]+ +Hz", text)
 
 
 def test_wrong_up_axis_is_reported_and_prevents_driving(carlab: Carlab, tmp_path: Path, world: World) -> None:
