@@ -23,6 +23,7 @@ import platform
 import re
 import subprocess
 import sys
+import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -66,7 +67,7 @@ class RunDirectory:
             DataError: The folder cannot be written.
         """
         stamp = datetime.fromtimestamp(wall_clock_ns() * 1e-9).strftime("%Y-%m-%d_%H%M%S")
-        slug = re.sub(r"[^\w.-]+", "-", name, flags=re.ASCII).strip("-.") or "run"
+        slug = re.sub(r"[^\w.-]+", "-", unicodedata.normalize("NFC", name)).strip("-.") or "run"
         base = Path(root) / f"{stamp}_{slug}"
         if base.parent.exists() and not base.parent.is_dir():
             raise DataError(f"{base.parent} is a file, not a folder for runs; choose another folder.")

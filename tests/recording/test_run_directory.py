@@ -4,6 +4,8 @@ import json
 import logging
 import re
 import subprocess
+import unicodedata
+from pathlib import Path
 
 import pytest
 
@@ -94,3 +96,8 @@ def test_git_state_distinguishes_changed_and_clean_trees(tmp_path):
     (tmp_path / "a").write_text("2")
     assert git_state(tmp_path) == {**clean, "dirty": True}
     assert environment()["carlab"]
+
+
+@pytest.mark.parametrize("name", ["Übung 1", unicodedata.normalize("NFD", "Übung 1")])
+def test_name_of_a_run_keeps_letters_of_every_language(name: str, tmp_path: Path) -> None:
+    assert RunDirectory.create(tmp_path, name).path.name.endswith("_Übung-1")
