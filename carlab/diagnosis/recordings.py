@@ -132,9 +132,10 @@ def _split(
                 "The held-out recordings have no unbroken stretch of half a second; hold out other recordings."
             )
         return fit_segments, held_out_segments
+    _check_duration(fit_segments, settings)
     early, late = split_segments(fit_segments, share, settings.held_out_window_s + settings.split_guard_s)
     recorded_s, remaining_s = (sum(segment.duration_s for segment in part) for part in (fit_segments, early))
-    if remaining_s < settings.min_fit_s <= recorded_s:
+    if remaining_s < settings.min_fit_s:
         raise Inconclusive(
             f"The recordings contain {recorded_s:.1f} s of driving, but only {remaining_s:.1f} s without the last part "
             "of each recording, which is held out, and the gap before it. Hold out whole recordings with --held-out, "
@@ -162,15 +163,20 @@ def _cut(
         raise Inconclusive(str(error)) from error
 
 
-def check_excitation(segments: Sequence[RecordingSegment], settings: WindowSettings) -> None:
-    """Raise Inconclusive if the excitation is not sufficient; the message states what to record."""
+def _check_duration(segments: Sequence[RecordingSegment], settings: WindowSettings) -> None:
+    """Raise Inconclusive if the segments to fit are too short."""
     seconds = sum(segment.duration_s for segment in segments)
     if seconds < settings.min_fit_s:
         raise Inconclusive(
-            f"The recordings to fit contain {seconds:.1f} s of driving (without parts that are held out). A diagnosis "
-            f"needs at least {settings.min_fit_s:.0f} s, better 100 s, with changing speed and steering, for example "
-            "carlab drive --policy excitation --episodes 2."
+            f"The recordings to fit contain {seconds:.1f} s of driving. A diagnosis needs at least "
+            f"{settings.min_fit_s:.0f} s, better 100 s, with changing speed and steering, for example carlab drive "
+            "--policy excitation --episodes 2."
         )
+
+
+def check_excitation(segments: Sequence[RecordingSegment], settings: WindowSettings) -> None:
+    """Raise Inconclusive if the excitation is not sufficient; the message states what to record."""
+    _check_duration(segments, settings)
     speed = np.concatenate([np.hypot(t.smooth[:, 3], t.smooth[:, 4]) for t in segments])
     if np.quantile(speed, 0.9) < settings.min_speed_mps:
         raise Inconclusive("The car hardly moves in the recordings to fit; record a drive.")

@@ -150,7 +150,7 @@ def test_short_recording_is_inconclusive_with_a_reason(tmp_path: Path) -> None:
     report = carlab.diagnose(carlab.load(csv_file(tmp_path / "short.csv")), out=tmp_path / "out")
     assert not report.is_conclusive
     assert report.verdict == "inconclusive"
-    assert "s" in report.sentence
+    assert "The recordings to fit contain 4.0 s of driving. A diagnosis needs at least 8 s" in report.sentence
     assert (tmp_path / "out" / "report.json").is_file()
 
 
