@@ -26,7 +26,7 @@ def run_realcars(options: BenchOptions) -> int:
         raise ConfigError("bench realcars needs --data FOLDER with recordings of one car; add it.")
     files = {path.name: path for path in recordings_in(options.data)}
     fit, held_out = split_by_name(list(files), options.held_out, options.fit)
-    with Interrupts() as interrupts, progress() as bar:
+    with Interrupts(second_raises=True) as interrupts, progress() as bar:
         row = bar.add_task("diagnosis", total=100, note="")
         report = diagnose(
             [files[name] for name in fit],

@@ -54,7 +54,7 @@ def _run_here(options: BenchOptions, case: RecordedCase, recordings: Recordings)
     from carlab.studies.rollouts import run_rollout_study
 
     scores: list[RolloutScore] = []
-    with Interrupts() as interrupts, progress() as bar:
+    with Interrupts(second_raises=True) as interrupts, progress() as bar:
         row = bar.add_task("rollouts", total=None, note="")
         study = run_rollout_study(
             case, recordings, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,

@@ -18,8 +18,9 @@ class Compare:
     """Find what changed between two groups of drives of one car: another day, battery, floor, tyre or set-up.
 
     Names the smallest set of effects and parameters that differ, each with a 90 % interval, and writes compare.json.
-    Each group needs 50 s of driving. ^C ends the search; compare.json then has the changes found so far. Exit code 0
-    with a verdict, 5 if the recordings are not sufficient, or if the search ended before it found a change.
+    Each group needs 50 s of driving. ^C ends the search; compare.json then has the changes found so far. A second ^C
+    ends at once, without compare.json. Exit code 0 with a verdict, 5 if the recordings are not sufficient, or if the
+    search ended before it found a change.
     """
 
     recordings: Positional[tuple[Path, ...]]
@@ -47,7 +48,7 @@ class Compare:
         from carlab.experiment.episodes.interrupts import Interrupts
 
         report_folder(self.out)
-        with Interrupts() as interrupts, progress() as bar:
+        with Interrupts(second_raises=True) as interrupts, progress() as bar:
             row = bar.add_task("comparison", total=100, note="")
             found = compare(
                 **arguments_of(self, compare),

@@ -22,8 +22,8 @@ class Diagnose:
     """Identify physics that recordings show and a simulator lacks, and validate it on held-out recordings.
 
     Writes report.html, report.json, report.rrd, summary.png and model.toml (the car file with the identified effects
-    and parameters). ^C ends the search; the report then has the effects found so far. Exit code 0 with a verdict, 5 if
-    the recordings are not sufficient for a verdict.
+    and parameters). ^C ends the search; the report then has the effects found so far. A second ^C ends at once, without
+    a report. Exit code 0 with a verdict, 5 if the recordings are not sufficient for a verdict.
     """
 
     recordings: Positional[tuple[Path, ...]]
@@ -88,7 +88,7 @@ class Diagnose:
         from carlab.experiment.episodes.interrupts import Interrupts
 
         report_folder(self.out)
-        with Interrupts() as interrupts, progress() as bar:
+        with Interrupts(second_raises=True) as interrupts, progress() as bar:
             row = bar.add_task("diagnosis", total=100, note="")
             report = diagnose(
                 **arguments_of(self, diagnose),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,3 +81,18 @@ def test_damaged_settings_of_a_run_name_the_remedy(carlab: Carlab, tmp_path: Pat
     assert "campaign.json: " in text
     assert text.endswith("restore the file, or name the folder of another run.")
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "compare"])
+def test_second_interrupt_ends_a_search_at_once(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    def interrupted_twice(*_: object, **options: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        assert options["stop"]()
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("the search continued after the second ^C")
+
+    monkeypatch.setattr(f"carlab.api.{verb}", interrupted_twice)
+    other = ("--with", "b.csv") if verb == "compare" else ()
+    assert carlab(verb, "a.csv", *other, "--out", tmp_path / "out") == (130, "carlab: Interrupted.")

@@ -28,6 +28,14 @@ def test_first_signal_requests_a_stop_and_second_one_is_urgent(number: signal.Si
     assert signal.getsignal(number) is before
 
 
+def test_second_signal_raises_in_a_computation() -> None:
+    with Interrupts(second_raises=True) as interrupts:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupts.requested.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
 def test_hangup_that_nohup_ignores_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

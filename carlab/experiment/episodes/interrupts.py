@@ -62,11 +62,15 @@ class Interrupts:
 
     SIGHUP stays ignored if it is ignored at the start: nohup ignores it so that a run outlives its terminal.
 
+    Args:
+        second_raises: whether the second signal raises KeyboardInterrupt, for computations that open no car.
+
     Raises:
         ConfigError: it is entered outside the main thread.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, second_raises: bool = False) -> None:
+        self._second_raises = second_raises
         self.count = 0
         self.urgent = Flag()
         self.requested = Flag()
@@ -116,7 +120,7 @@ class Interrupts:
         self.requested.set()
         if self.count > 1:
             self.urgent.set()
-        if self._is_prompting:
+        if self._is_prompting or (self._second_raises and self.count > 1):
             self._is_prompting = False
             raise KeyboardInterrupt
 
