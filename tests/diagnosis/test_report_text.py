@@ -231,6 +231,8 @@ def test_curves_are_advised_for_a_relevant_residual(verdict: str, share: float, 
     unexplained = Unexplained(share, ("vx",), "everywhere alike", "", "")
     assert ("--curves" in curves_advice(replace(diagnosis(verdict), unexplained=unexplained))) == is_advised
     assert curves_advice(diagnosis(verdict)) == ""
+    stopped = replace(diagnosis(verdict), unexplained=unexplained, search=SearchExtent(False, "user"))
+    assert curves_advice(stopped) == "", "a complete search comes first"
 
 
 def test_next_drive_separates_the_strongest_set() -> None:
