@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import dataclasses
 import inspect
 import io
+import itertools
+import json
 import os
 import re
 from pathlib import Path
@@ -107,4 +111,51 @@ def _effect(effect: Any) -> str:
     )
 
 
-SECTIONS = {"cli": _command_line, "effects": _effects, "curves": _curves, "decisions": _decisions}
+def _tables_of_hardware() -> str:
+    from carlab.core.safety import SafetyEnvelope
+    from drivers.calibration import ActuatorCalibration
+    from drivers.config import ActuatorConfig
+    from mocap.config import MocapConfig
+
+    tables = {"actuator": ActuatorConfig, "calibration": ActuatorCalibration, "mocap": MocapConfig}
+    return "\n".join(_table_of_hardware(name, cls) for name, cls in (tables | {"limits": SafetyEnvelope}).items())
+
+
+def _table_of_hardware(name: str, cls: type) -> str:
+    """Text of a table of ``[hardware]``, and its keys with their default values."""
+    text = (inspect.getdoc(cls) or "").split("\n\nRaises:")[0]
+    meanings = _meanings(cls)
+    rows = [
+        f"| `{field.name}` | `{_toml(field.default)}` |" + (f" {meanings.get(field.name, '')} |" if meanings else "")
+        for field in dataclasses.fields(cls)
+        if field.name != "arena_m"  # the corners of [hardware.arena]
+    ]
+    head = "| key | default |\n| --- | --- |"
+    if meanings:
+        head = "| key | default | meaning |\n| --- | --- | --- |"
+    return "\n".join([f"### `[hardware.{name}]`\n\n{text}\n\n{head}", *rows, ""])
+
+
+def _meanings(cls: type) -> dict[str, str]:
+    """The text after each attribute of a class that has one."""
+    body = ast.parse(inspect.getsource(cls)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    return {
+        field.target.id: ast.literal_eval(text.value)
+        for field, text in itertools.pairwise(body.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr)
+    }
+
+
+def _toml(value: Any) -> str:
+    """A default value as a car file states it."""
+    return "none" if value is None else json.dumps(value)
+
+
+SECTIONS = {
+    "cli": _command_line,
+    "effects": _effects,
+    "curves": _curves,
+    "hardware": _tables_of_hardware,
+    "decisions": _decisions,
+}

@@ -17,14 +17,14 @@ MULTICAST_GROUP = "239.74.163.2"
 class ActuatorConfig:
     """Configuration of the actuator: the table ``[hardware.actuator]``.
 
-    ``kind`` names an entry of ``DEVICE_KINDS``. A serial kind uses ``port`` and ``baud`` (ignored on USB). A bus uses
-    ``interface`` (any of python-can: socketcan, slcan, pcan, ..., ``udp_multicast`` between processes, ``virtual``
-    within one), ``channel`` (the serial port of an slcan adapter), ``bitrate``, the ``controller_id`` and a ``host_id``
-    that is unique on the bus. The sender sends at ``rate_hz``. It replaces a command older than ``watchdog_s`` by
-    neutral, so ``control_period`` of the car file must be shorter; a command older than ``latch_s`` latches a fault. It
-    polls telemetry at ``telemetry_rate_hz``; telemetry older than ``telemetry_stale_s`` gives neutral, older than
-    ``telemetry_lost_s`` latches a fault.
-    ``realtime_priority`` requests SCHED_FIFO; the sender runs without it if the system refuses.
+    ``kind`` is vesc_serial or vesc_can (``DEVICE_KINDS``). A serial kind uses ``port`` and ``baud`` (ignored on USB). A
+    bus uses ``interface`` (any of python-can: socketcan, slcan, pcan, ..., ``udp_multicast`` between processes,
+    ``virtual`` within one), ``channel`` (the serial port of an slcan adapter), ``bitrate``, the ``controller_id`` and a
+    ``host_id`` that is unique on the bus. The sender sends at ``rate_hz``. It replaces a command older than
+    ``watchdog_s`` by neutral, so ``control_period`` of the car file must be shorter; a command older than ``latch_s``
+    latches a fault. It polls telemetry at ``telemetry_rate_hz``; telemetry older than ``telemetry_stale_s`` gives
+    neutral, older than ``telemetry_lost_s`` latches a fault. ``realtime_priority`` requests SCHED_FIFO; the sender runs
+    without it if the system refuses.
     """
 
     kind: str = "vesc_serial"

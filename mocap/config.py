@@ -19,7 +19,11 @@ MAX_TIMEOUT_S = 600.0
 
 @dataclass(frozen=True, slots=True)
 class MocapConfig:
-    """Address of a NatNet server (Motive), and the rigid body of the car. Raises ConfigError for invalid values."""
+    """Address of a NatNet server (Motive), and the rigid body of the car.
+
+    Raises:
+        ConfigError: a value is invalid.
+    """
 
     server_address: str = "127.0.0.1"
     """Address of the computer that runs Motive."""

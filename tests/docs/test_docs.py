@@ -1,5 +1,6 @@
 """Test the documentation: commands parse or run, car files load, programs run, links and references resolve."""
 
+import dataclasses
 import glob
 import os
 import re
@@ -16,6 +17,10 @@ import pytest
 from carlab.cars import load_car_file
 from carlab.cli import _verbs, run
 from carlab.core.car import Car
+from carlab.core.safety import SafetyEnvelope
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from mocap.config import MocapConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -236,6 +241,10 @@ def test_site_builds_without_warnings(tmp_path: Path) -> None:
         "M -= coefficient r",
     ):
         assert equation in effects
+    car_file = (reference / "car-file.html").read_text(encoding="utf-8")
+    for table in (ActuatorConfig, ActuatorCalibration, MocapConfig, SafetyEnvelope):
+        for key in {field.name for field in dataclasses.fields(table)} - {"arena_m"}:
+            assert f"<td><code>{key}</code></td>" in car_file, "a table lists each key with its default"
 
 
 def test_page_about_a_new_car_lists_its_interface() -> None:
