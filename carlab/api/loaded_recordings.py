@@ -36,11 +36,19 @@ class LoadedRecordings:
 
 
 def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:
-    """Recordings as a list, with strings converted to paths."""
+    """Recordings as a list, with strings converted to paths. Raises ConfigError for another type."""
     from carlab.core.episode_data import EpisodeData
+    from carlab.core.errors import ConfigError
 
-    single = isinstance(given, (str, Path, Recording, EpisodeData))
-    return [Path(item) if isinstance(item, str) else item for item in ([given] if single else given)]
+    kinds = (str, Path, Recording, EpisodeData)
+    items = list(given) if isinstance(given, Iterable) and not isinstance(given, kinds) else [given]
+    for item in items:
+        if not isinstance(item, kinds):
+            raise ConfigError(
+                f"An object of type {type(item).__name__} is no recording; give a path, a Recording, or an EpisodeData "
+                "of your own arrays (carlab.core.episode_data)."
+            )
+    return [Path(item) if isinstance(item, str) else item for item in items]
 
 
 def assigned(
@@ -131,6 +139,7 @@ def _read_item(item: RecordingLike, role: str, latency_s: float, loaded: LoadedR
 
     path = _path_of(item)
     if path is None:
+        _check_times(item)
         loaded.episodes.append(align_states(item, latency_s))
         digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
         return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
@@ -142,6 +151,19 @@ def _read_item(item: RecordingLike, role: str, latency_s: float, loaded: LoadedR
         if read.is_recovered:
             loaded.notes.append(f"{path} {read.recovery}.")
     return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
+
+
+def _check_times(episode: EpisodeData) -> None:
+    """Raise DataError if the times of an episode do not increase, or are not in seconds."""
+    import numpy as np
+
+    from carlab.core.errors import DataError
+    from carlab.recording.audit.file_checks import MAX_PERIOD_S
+
+    if not np.all(np.diff(episode.times_s) > 0.0):
+        raise DataError("times_s of an EpisodeData does not increase from row to row; sort the rows.")
+    if episode.period_s > MAX_PERIOD_S:
+        raise DataError(f"The rows of an EpisodeData are {episode.period_s:.4g} s apart; give times_s in seconds.")
 
 
 def _read_csv(path: Path, mapping: Any, loaded: LoadedRecordings) -> None:

@@ -121,6 +121,11 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
         ConfigError: the file does not exist, or an option or mapping is invalid.
         DataError: the file cannot be read as declared.
     """
+    if not isinstance(path, (str, Path)):
+        raise ConfigError(
+            f"carlab.load reads a file, but its argument has the type {type(path).__name__}; give a path. For your own "
+            "arrays make a carlab.core.episode_data.EpisodeData."
+        )
     path = required_file(Path(path))
     if is_csv(path):
         from carlab.recording.csv.foreign import import_csv

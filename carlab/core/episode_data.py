@@ -15,14 +15,15 @@ from carlab.core.quantities import FloatArray
 class EpisodeData:
     """An episode of T commands. Row k of ``sent`` was sent at ``times_s[k]`` and held until ``times_s[k + 1]``.
 
-    times_s     (T + 1,)     [s] time of each observation on the recording's clock
-    states      (T + 1, 6)   x, y [m], yaw [rad] of base_link in map; vx, vy [m/s], yaw rate [rad/s] in the body frame
-    requested   (T, 2)       steering, throttle requested by the policy
-    sent        (T, 2)       steering, throttle sent by the safety gate
-    rewards     (T,)         reward of each transition; NaN if the recording has none
-    poses       (P, 4)       raw motion capture: capture time [s], x, y [m], yaw [rad]; P may be 0
-    metadata                 texts: car, reality, policy, task, seed, end_reason, end_detail, units ...
-    extra                    further columns of a foreign file by name, each (T + 1,)
+    Attributes:
+        times_s: time of each observation on the recording's clock [s] (T + 1,).
+        states: x, y [m], yaw [rad] of base_link in map; vx, vy [m/s], yaw rate [rad/s] in the body frame (T + 1, 6).
+        requested: steering, throttle requested by the policy (T, 2).
+        sent: steering, throttle sent by the safety gate (T, 2).
+        rewards: reward of each transition (T,); NaN if the recording has none.
+        poses: raw motion capture: capture time [s], x, y [m], yaw [rad] (P, 4); P may be 0.
+        metadata: texts: car, reality, policy, task, seed, end_reason, end_detail, units ...
+        extra: further columns of a file by name, each (T + 1,).
 
     Raises:
         DataError: an array has another shape.
