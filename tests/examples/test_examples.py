@@ -1,6 +1,7 @@
 """Test that each script in examples/ runs with small settings and prints its results."""
 
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -14,6 +15,7 @@ FEW_STEPS = ["--updates", "64", "--model-steps", "20"]
 SCRIPTS = {
     "own_policy.py": [],
     "write_task.py": [],
+    "fit_sim_fsvgd.py": ["--steps", "400"],
     "add_effect.py": ["--seconds", "20"],
     "diagnose_csv.py": ["--seconds", "20", "--effects", "steering_lag"],
     "train_in_learned_car.py": FEW_STEPS,
@@ -30,7 +32,8 @@ def output_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Cap
 
     def run(script: str) -> str:
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", [script, *SCRIPTS[script], "--out", "runs"])
+        out = [] if script == "fit_sim_fsvgd.py" else ["--out", "runs"]
+        monkeypatch.setattr(sys, "argv", [script, *SCRIPTS[script], *out])
         runpy.run_path(str(EXAMPLES / script), run_name="__main__")
         return capfd.readouterr().out
 
@@ -50,6 +53,13 @@ def output_of_process(script: str, folder: Path) -> str:
 
 def test_each_example_has_settings() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
+
+
+def test_posterior_of_own_arrays_predicts_between_the_rows(output_of: Example) -> None:
+    line = next(line for line in output_of("fit_sim_fsvgd.py").splitlines() if line.startswith("x +0.5"))
+    predicted, std, true = map(float, re.findall(r"[+-]?\d\.\d\d", line))
+    assert predicted == pytest.approx(true, abs=0.1)
+    assert 0.0 < std < 0.2
 
 
 def test_own_policy_holds_its_target_speed(output_of: Example) -> None:
