@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import inspect
+import shlex
 import sys
 import types
 from collections.abc import Mapping
@@ -81,7 +82,7 @@ class TaskChoice:
             if self.sha256:
                 raise ConfigError(
                     f"This run has the task {self.name}, whose code a run folder does not keep; name the file again: "
-                    f"--task PATH/{self.name}."
+                    f"--task {shlex.quote(f'PATH/{self.name}')}."
                 )
             return self
         if given.name != self.name or (given.track is not None and given.track != self.track):

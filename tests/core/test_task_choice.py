@@ -74,6 +74,12 @@ def test_saved_task_has_no_path_and_runs_no_code(file: Path) -> None:
     assert read.named_again(choose_task(f"{file}:Reach")).load().name == "reach"
 
 
+def test_name_of_a_file_with_a_space_is_quoted_for_the_shell(file: Path) -> None:
+    saved = choose_task(f"{file.rename(file.with_name('my task.py'))}:Reach").to_table()
+    with pytest.raises(ConfigError, match=r"--task 'PATH/my task\.py:Reach'"):
+        TaskChoice.from_table(saved).named_again(None)
+
+
 def test_changed_file_is_refused_in_a_later_run_and_during_a_run(file: Path) -> None:
     saved = choose_task(f"{file}:Reach")
     file.write_text(USER_TASK + "\n")
