@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from carlab.cars.car_file import CarFile, default_car, is_preset, load_car_file
 from carlab.core.car import Car
-from carlab.core.errors import ConfigError
+from carlab.core.errors import CarlabError, ConfigError
 from carlab.core.quantities import Action, ActionLimits, Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.track import Track
 from drivers.config import ActuatorConfig
 from sim_backends.car_parameters import SimulatorConfig, preset_names
 
+_LOG = logging.getLogger(__name__)
 PLUGIN_GROUP = "carlab.cars"
 WATCHDOG_PERIODS = 2.0
 """Minimum ratio of the watchdog to the control period, and of the latch to the watchdog, of a car without hardware."""
@@ -90,10 +92,7 @@ def _choose(
     if isinstance(name, str) and name in plugins:
         if truth is not None:
             raise ConfigError(f"--reality needs a simulated or emulated car; '{name}' is a plug-in. Remove --reality.")
-        choice: CarChoice = plugins[name].load()(
-            default_car() if vehicle is None else _read(vehicle, "--vehicle"), seed
-        )
-        return choice
+        return _from_plugin(plugins[name], default_car() if vehicle is None else _read(vehicle, "--vehicle"), seed)
     if vehicle is not None:
         raise ConfigError(f"--vehicle needs --car sim or emulated; '{_name_of(name)}' has its own physics.")
     if isinstance(name, str):
@@ -109,6 +108,26 @@ def _choose(
     if truth is not None:
         raise ConfigError(f"--reality needs a simulated or emulated car; '{_name_of(name)}' is real. Remove --reality.")
     return _real(file, seed)
+
+
+def _from_plugin(point: importlib.metadata.EntryPoint, file: CarFile, seed: int) -> CarChoice:
+    """The car of another package. Raises ConfigError if its function fails or returns something else."""
+    try:
+        choice = point.load()(file, seed)
+    except CarlabError:
+        raise
+    except Exception as error:
+        _LOG.debug("The car of another package failed.", exc_info=True)
+        raise ConfigError(
+            f"The car '{point.name}' cannot be made: {point.value} failed with {type(error).__name__}: {error}. With "
+            "--verbose carlab prints where."
+        ) from error
+    if not isinstance(choice, CarChoice):
+        raise ConfigError(
+            f"The car '{point.name}' cannot be made: {point.value} returned an object of type "
+            f"{type(choice).__name__}; return a carlab.cars.CarChoice."
+        )
+    return choice
 
 
 def _check_watchdog(choice: CarChoice) -> None:
