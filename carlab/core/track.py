@@ -166,14 +166,18 @@ def track_from_table(table: Any, where: str) -> Track:
 
 
 def read_track(path: Path | str) -> Track:
-    """Read a track from a CSV file (commas or semicolons) with the columns x, y and width [m] and a header.
+    """Read a track from a CSV file with the columns x, y and width [m] and a header.
+
+    Columns are separated by commas, or by semicolons, with which numbers may have decimal commas.
 
     Raises:
         ConfigError: it cannot be read or driven.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
-        reader = csv.reader(io.StringIO(text), delimiter=";" if text.count(";") > text.count(",") else ",")
+        title = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+        separator = ";" if ";" in title else ","
+        reader = csv.reader(io.StringIO(text), delimiter=separator)
         lines = [(reader.line_num, row) for row in reader if row and not row[0].lstrip().startswith("#")]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
@@ -184,7 +188,8 @@ def read_track(path: Path | str) -> Track:
     rows = []
     for line_number, row in lines[1:]:
         try:
-            rows.append([float(row[header.index(name)]) for name in COLUMNS])
+            cells = [row[header.index(name)] for name in COLUMNS]
+            rows.append([float(cell.replace(",", ".") if separator == ";" else cell) for cell in cells])
         except (ValueError, IndexError) as error:
             raise ConfigError(f"Row {line_number} of the track {path} must have numbers for x, y and width.") from error
     return _checked(rows, f"The track {path}")

@@ -134,6 +134,10 @@ def test_track_of_a_csv_file_and_of_a_table_are_equal(tmp_path: Path) -> None:
     assert read_track(file) == expected
     file.write_text(file.read_text().replace(",", ";"))
     assert read_track(file) == expected
+    file.write_text("# oval, 0,5 m\n" + file.read_text().replace(".", ","))
+    assert read_track(file) == expected, "decimal commas"
+    file.write_text("# oval; closed\nx,y,width\n0,0,0.5\n2,0,0.6\n2,2,0.7\n")
+    assert read_track(file) == expected, "a comment does not choose the separator"
     assert track_from_table(expected.to_table(), "[track]") == expected
     assert track_from_table({"centre_line_m": [[0, 0], [2, 0], [2, 2]], "width_m": 0.5}, "").width_m == (0.5,) * 3
 
