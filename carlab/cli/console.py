@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from rich import box
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.measure import Measurement
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -20,6 +21,7 @@ from carlab.cli.exit_codes import EXIT_BROKEN_PIPE
 from carlab.core.quantities import Reality
 
 FILE_WIDTH_CHARS = 140
+MAX_TABLE_CHARS = 1000
 PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
 """Packages of the program, whose logs ``--verbose`` shows."""
 UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}
@@ -66,7 +68,10 @@ def fail(message: str) -> None:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:
-    """Print a table; with ``numeric``, the columns after the first are right-aligned."""
+    """Print a table; with ``numeric``, the columns after the first are right-aligned.
+
+    A terminal that is too narrow for the table's words and numbers gets one paragraph for each row.
+    """
     # Text instead of str: rich would interpret the unit "[m]" as mark-up.
     rich_table = Table(
         title=Text(title, "bold") if title else None,
@@ -82,7 +87,14 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
         rich_table.add_row(*(Text(cell) for cell in row))
     if title:
         console.print()
-    console.print(rich_table)
+    if Measurement.get(console, console.options.update(max_width=MAX_TABLE_CHARS), rich_table).minimum <= console.width:
+        console.print(rich_table)
+        return
+    if title:
+        console.print(Text(title, "bold"))
+    for row in rows:
+        cells = ", ".join(" ".join((*column.split(), cell)) for column, cell in zip(columns[1:], row[1:], strict=True))
+        console.print(Text(f"{columns[0]} {row[0]}: {cells}"))
 
 
 def readings_table(title: str, readings: Mapping[str, float]) -> None:

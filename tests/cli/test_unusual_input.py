@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from carlab.cli.console import console
+from carlab.cli.console import console, table
 from tests.cli.test_bad_input import canonical_csv, write
 
 Carlab = Callable[..., tuple[int, str]]
@@ -81,6 +82,18 @@ def test_damaged_settings_of_a_run_name_the_remedy(carlab: Carlab, tmp_path: Pat
     assert "campaign.json: " in text
     assert text.endswith("restore the file, or name the folder of another run.")
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("width", [30, 60, 80])
+def test_narrow_terminal_splits_no_number(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(console, "_width", width)
+    columns = ["model", "position [m]", "yaw [rad]", "vx [m/s]", "vy [m/s]", "score"]
+    table("Errors", columns, [["noise floor", "1.0551", "0.8250", "0.4844", "0.3147", "132.48"]])
+    text = capsys.readouterr().out
+    assert re.findall(r"[\d.]+", text) == ["1.0551", "0.8250", "0.4844", "0.3147", "132.48"]
+    assert max(map(len, text.splitlines())) <= width
 
 
 @pytest.mark.parametrize("verb", ["diagnose", "compare"])
