@@ -13,6 +13,21 @@ from carlab.core.quantities import PoseSample
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.plant import Pose
 
+CLOCK_TOLERANCE = 1e-4
+"""Relative difference between a control period and a number of frames that counts as rounding in the car file."""
+
+
+def frame_rate_hz(config: SimulatorConfig) -> float:
+    """Frames a second; a control period that is a whole number of frames but for rounding is exactly that number.
+
+    Otherwise a control period of 0.0333333333 s would begin 33 ps earlier relative to the frames at each tick.
+    """
+    frames = config.control_period_s * config.mocap.rate_hz
+    whole = round(frames)
+    if whole and abs(frames - whole) <= CLOCK_TOLERANCE * whole:
+        return whole / config.control_period_s
+    return config.mocap.rate_hz
+
 
 class PoseProvider(Protocol):
     """Source of true poses for a sensor, for example a plant."""
@@ -24,8 +39,8 @@ class PoseProvider(Protocol):
 class MocapSensor:
     """Samples a plant at the rate of the car file. The caller supplies the time, simulated or real.
 
-    Exposure ``k`` after ``reset`` is at ``start + k / rate`` and has its own random numbers, so measurements depend on
-    the seed and the exposure only, not on the times of the calls.
+    Exposure ``k`` after ``reset`` is at ``start + k / frame_rate_hz`` and has its own random numbers, so measurements
+    depend on the seed and the exposure only, not on the times of the calls.
 
     Args:
         config: Rate, noise, latency and share of lost frames; effects that change the latency.
@@ -35,6 +50,7 @@ class MocapSensor:
 
     def __init__(self, config: SimulatorConfig, seed: int = 0, *, extra_latency_s: float = 0.0) -> None:
         self._mocap = config.mocap
+        self._frame_rate_hz = frame_rate_hz(config)
         self.latency_s = config.latency_s() + extra_latency_s
         self.lost = 0
         self._rng = np.random.default_rng(seed)
@@ -56,7 +72,7 @@ class MocapSensor:
 
     def next_exposure_s(self) -> float:
         """Time of the next exposure [s]."""
-        return self._start_s + self._next / self._mocap.rate_hz
+        return self._start_s + self._next / self._frame_rate_hz
 
     def expose(self, t_s: float, plant: PoseProvider) -> PoseSample | None:
         """Make one exposure at ``t_s``; None if the frame is lost. Does not change the schedule."""
@@ -93,4 +109,4 @@ class MocapSensor:
     def settling_time_s(self, window_s: float) -> float:
         """Time until a velocity window of ``window_s`` is filled with arrived samples [s]."""
         periods = math.ceil(window_s * self._mocap.rate_hz) + 2
-        return periods / self._mocap.rate_hz + self.latency_s
+        return periods / self._frame_rate_hz + self.latency_s

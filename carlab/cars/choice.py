@@ -163,7 +163,9 @@ def _simulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -
     from sim_backends.simulated_car import SimulatedCar
 
     watchdog_s = _actuator(file).watchdog_s
-    car = SimulatedCar(truth or file.simulator, seed=seed, name=file.name, watchdog_s=watchdog_s)
+    # The period of the control loop is that of the car file.
+    simulator = replace(truth or file.simulator, control_period_s=file.simulator.control_period_s)
+    car = SimulatedCar(simulator, seed=seed, name=file.name, watchdog_s=watchdog_s)
     text = _config_toml(file, "sim")
     return CarChoice(car, file.simulator, _envelope(file), text, track=file.track, watchdog_s=watchdog_s)
 

@@ -75,25 +75,23 @@ class Pacer:
     period_s: float
     late_s: list[float] = field(default_factory=list)
     skipped: int = 0
-    _next_s: float | None = None
+    _start_s: float | None = None
+    _periods: int = 0
 
     def start(self) -> float:
         """Set the first deadline to now and return it [s]."""
-        self._next_s = self.clock.now_s()
-        return self._next_s
+        self._start_s, self._periods = self.clock.now_s(), 0
+        return self._start_s
 
     def wait(self) -> TickTiming:
         """Sleep until the next future deadline; returns the lateness of the wake-up."""
-        if self._next_s is None:
-            self.start()
-        assert self._next_s is not None
-        deadline_s = self._next_s + self.period_s
-        behind_s = self.clock.now_s() - deadline_s
+        start_s = self.start() if self._start_s is None else self._start_s
+        behind_s = self.clock.now_s() - (start_s + (self._periods + 1) * self.period_s)
         skipped = int(behind_s // self.period_s) if behind_s >= self.period_s else 0
-        deadline_s += skipped * self.period_s
+        self._periods += 1 + skipped
+        deadline_s = start_s + self._periods * self.period_s
         self.clock.sleep_until(deadline_s)
         late_s = self.clock.now_s() - deadline_s
-        self._next_s = deadline_s
         self.skipped += skipped
         self.late_s.append(late_s)
         return TickTiming(deadline_s, late_s, skipped)

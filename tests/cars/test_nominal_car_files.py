@@ -4,10 +4,12 @@ import tomllib
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from carlab.cars import choose_car, load_car_file
 from carlab.cli import run
+from carlab.core.clock import Pacer
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, CarState, Reality
 from sim_backends.car_parameters import SimulatorConfig
@@ -87,3 +89,17 @@ def test_file_has_priority_over_a_preset_of_the_same_name(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     Path("eth_rc_car").write_text("[vehicle]\nmass = 9.0\n")
     assert load_car_file(Path("eth_rc_car")).simulator.parameters.mass_kg == 9.0
+
+
+def test_frames_of_a_different_reality_follow_the_control_period_of_the_car_file(tmp_path):
+    file = tmp_path / "reality.toml"
+    file.write_text("[timing]\ncontrol_period = 0.05\n")
+    choice = choose_car("sim", reality=file)
+    with choice.car as car:
+        pacer = Pacer(car.clock, choice.control_period_s)
+        pacer.start()
+        sequences = []
+        for _ in range(100):
+            pacer.wait()
+            sequences.append(car.observe().sequence)
+    assert np.diff(sequences).tolist() == [4] * 99

@@ -74,6 +74,13 @@ def test_the_pacer_skips_missed_ticks_and_keeps_the_grid() -> None:
     assert pacer.statistics_ms()["skipped"] == 2
 
 
+def test_rounding_of_deadlines_does_not_accumulate() -> None:
+    pacer = Pacer(SimulatedClock(1000.0), 0.1)
+    start_s = pacer.start()
+    deadlines_s = [pacer.wait().deadline_s for _ in range(20_000)]
+    assert deadlines_s == [start_s + 0.1 * k for k in range(1, 20_001)]
+
+
 @pytest.mark.realtime
 def test_the_monotonic_clock_never_returns_early() -> None:
     clock = MonotonicClock()

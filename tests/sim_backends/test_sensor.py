@@ -32,6 +32,15 @@ def test_samples_come_at_the_rate_and_arrive_after_the_latency():
         assert s.t_receive_s == pytest.approx(s.t_capture_s + 0.025)
 
 
+def test_frames_drift_through_a_control_period_that_is_no_whole_number_of_frames():
+    for period_s, period_frames in ((0.033, 3.96), (0.001, 0.12)):
+        sensor = MocapSensor(SimulatorConfig(control_period_s=period_s))
+        sensor.reset(0.0)
+        samples = sensor.samples_until(10.0, Moving())
+        assert len(samples) == 1200
+        assert period_s / (samples[1].t_capture_s - samples[0].t_capture_s) == pytest.approx(period_frames)
+
+
 def test_samples_do_not_depend_on_the_times_of_the_calls():
     rows = []
     for stops in ([1.0], [*np.arange(0.0, 1.0, 0.0137).tolist(), 1.0]):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlab.core.clock import MonotonicClock
+from carlab.core.clock import MonotonicClock, Pacer
 from carlab.core.errors import (
     ActionOutOfRangeError,
     ActuatorFaultError,
@@ -50,6 +50,19 @@ def test_observations_match_the_true_states():
         assert last.state.yaw_rate_radps == pytest.approx(true.yaw_rate_radps, abs=0.1)
         sequences = [p.sequence for o in observations for p in o.poses]
         assert sequences == list(range(sequences[0], sequences[-1] + 1))
+
+
+@pytest.mark.parametrize("period_s", [1 / 30, 0.0333333333, 0.033333])
+def test_the_age_of_the_pose_is_the_same_at_each_tick(period_s):
+    config = SimulatorConfig(control_period_s=period_s)
+    with SimulatedCar(config) as car:
+        pacer = Pacer(car.clock, period_s)
+        pacer.start()
+        ages_s = []
+        for _ in range(3000):
+            pacer.wait()
+            ages_s.append(car.clock.now_s() - car.observe().t_capture_s)
+    assert ages_s == pytest.approx([config.mocap.latency_s] * 3000, abs=1e-9)
 
 
 def test_equal_seeds_give_equal_bytes():
