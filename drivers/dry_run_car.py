@@ -79,6 +79,10 @@ class DryRunCar(Car):
         """Place the wrapped car."""
         return self.car.place(state)
 
+    def seed_noise(self, seed: int) -> None:
+        """Seed the noise of the wrapped car."""
+        self.car.seed_noise(seed)
+
     def close(self) -> None:
         """Close the car."""
         self._is_open = self._is_armed = False

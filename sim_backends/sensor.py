@@ -53,7 +53,7 @@ class MocapSensor:
         self._frame_rate_hz = frame_rate_hz(config)
         self.latency_s = config.latency_s() + extra_latency_s
         self.lost = 0
-        self._rng = np.random.default_rng(seed)
+        self.seed(seed)
         self._start_s = 0.0
         self._next = 0
         self._sequence = 0
@@ -63,6 +63,10 @@ class MocapSensor:
     def rate_hz(self) -> float:
         """Exposures a second."""
         return self._mocap.rate_hz
+
+    def seed(self, seed: int) -> None:
+        """Restart the random numbers of noise and lost frames."""
+        self._rng = np.random.default_rng(seed)
 
     def reset(self, t_s: float) -> None:
         """Restart with the first exposure at ``t_s`` and no samples in flight; sequence numbers and noise continue."""

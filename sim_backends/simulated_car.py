@@ -118,6 +118,10 @@ class SimulatedCar(Car):
         self.clock.sleep_until(arrive_s)
         return True
 
+    def seed_noise(self, seed: int) -> None:
+        """Restart the random numbers of the motion capture with a seed."""
+        self._sensor.seed(seed)
+
     @property
     def watchdog_trips(self) -> int:
         """Number of times since ``open`` that the watchdog has set neutral."""

@@ -244,6 +244,10 @@ class EmulatedCar(Car):
             self.hardware.observe()
         return placed
 
+    def seed_noise(self, seed: int) -> None:
+        """Restart the random numbers of the emulated motion capture with a seed."""
+        self.world.request(do="seed", seed=seed)
+
     def close(self) -> None:
         """Send neutral, disconnect, and end the world."""
         car, self._car = self._car, None

@@ -138,6 +138,9 @@ class World:
                     self._plant.reset(CarState(*(float(v) for v in request["state"])), now_s)
                     self._command = Action()
                 return {"t_s": now_s}
+            case "seed":
+                with self._lock:
+                    self._sensor.seed(int(request["seed"]))
             case "state":
                 with self._lock:
                     now_s = self.clock.now_s()

@@ -96,8 +96,8 @@ class Learn:
     third it is multiplied by 3 / episode."""
 
     seed: int = 0
-    """Seed of all random numbers. The same seed gives the same run. Exceptions: a resumed run, because the noise of the
-    simulated sensors begins again; with --prior auto a run after its first diagnosis, which has a time limit."""
+    """Seed of all random numbers. The same seed gives the same run. Exceptions: a resumed run, whose times
+    have other rounding errors; with --prior auto a run after its first diagnosis, which has a time limit."""
 
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""

@@ -67,6 +67,9 @@ class Car(ABC):
         """Put the car at ``state`` without driving; returns False if a person has to do it."""
         return False
 
+    def seed_noise(self, seed: int) -> None:  # noqa: B027
+        """Restart the random numbers of simulated sensors with a seed; real sensors have none."""
+
     def check(self, action: Action) -> None:
         """Raise ActionOutOfRangeError if ``action`` is not a number or beyond the limits; sends nothing."""
         if not action.is_finite:

@@ -53,6 +53,22 @@ def test_late_answer_is_not_used_for_the_next_request(world: EmulatedWorld, monk
     assert "entries" in world.request(do="log")
 
 
+def test_seed_restarts_the_noise_of_the_emulated_motion_capture() -> None:
+    def positions_m(car: EmulatedCar) -> list[float]:
+        """Measured x of a car at rest after seeding its noise."""
+        car.seed_noise(7)
+        car.observe()
+        car.clock.sleep_until(car.clock.now_s() + 1.0)
+        return [round(pose.x_m, 7) for pose in car.observe().poses]
+
+    with EmulatedCar(default_car(), seed=1) as car:
+        first, second = positions_m(car), positions_m(car)
+    # The number of frames between the seeding and the first pose differs.
+    windows = [first[k : k + 10] for k in range(len(first) - 10)]
+    assert len(second) > 60
+    assert second[50:60] in windows
+
+
 def test_killed_world_is_reported_and_closes(world: EmulatedWorld) -> None:
     os.kill(world.addresses["pid"], signal.SIGKILL)
     for _ in range(2):

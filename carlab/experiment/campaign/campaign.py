@@ -274,6 +274,8 @@ class Campaign:
 
     def _drive(self, number: int) -> EpisodeResult | None:
         agent = SacAgent.load(model_folder(self.run.models, number), SacSettings(), self.plan.seed)
+        seed = int(np.random.SeedSequence((self.plan.seed, number)).generate_state(1)[0])
+        self.choice.car.seed_noise(seed)
         session = Session(
             self.choice.car,
             agent.policy(),
@@ -281,7 +283,7 @@ class Campaign:
             self._envelope,
             self.run,
             self.choice.control_period_s,
-            seed=int(np.random.SeedSequence((self.plan.seed, number)).generate_state(1)[0]),
+            seed=seed,
             max_ticks=self.max_ticks,
             config_toml=self.choice.config_toml,
             metadata={"model": str(number), "method": self.plan.method},
