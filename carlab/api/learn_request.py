@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -24,25 +24,18 @@ Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-cor
 Device = Literal["cpu", "cuda"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LearnRequest:
-    """The arguments of ``learn``."""
+    """The arguments of ``learn``, with the defaults of a new run.
+
+    Attributes:
+        given: names of the arguments that the caller gives, among those that a resumed run cannot change.
+    """
 
     car: str | Path | CarFile
     episodes: int | None
-    ticks: int | None
-    prior: str | Path | CarFile
-    method: Method
-    history: int | None
-    model_steps: int | None
-    updates: int
-    seed: int
     device: Device | None
-    place: bool
     resume: Path | None
-    out: Path
-    name: str
-    rerun: bool
     live: bool
     viewer: str | None
     vehicle: str | Path | CarFile | None
@@ -52,6 +45,18 @@ class LearnRequest:
     track: Path | str | None
     ray: str
     ray_wait: float
+    ticks: int | None = None
+    prior: str | Path | CarFile = "kinematic"
+    method: Method = "gp-sim-posterior"
+    history: int | None = None
+    model_steps: int | None = None
+    updates: int = 30000
+    seed: int = 0
+    place: bool = True
+    rerun: bool = True
+    out: Path = Path("runs")
+    name: str = "learn"
+    given: frozenset[str] = field(default=frozenset())
 
     @property
     def car_options(self) -> str:

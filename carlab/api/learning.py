@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import inspect
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from carlab.api.arguments import above_zero, at_least, at_most, valid_seed, whole_number
 from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 
 EPISODES = 20
 PLAN_ARGUMENTS = ("method", "history", "model_steps", "updates", "seed", "ticks")
-"""Arguments that a run keeps when it is resumed."""
+"""Arguments that are part of the training plan of a run."""
 
 
 @dataclass(slots=True)
@@ -134,10 +133,10 @@ class LearnRun:
 
 def learn(
     car: str | Path | CarFile = "sim", *, task: str | Task | None = None, track: Path | str | None = None,
-    episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile = "kinematic",
-    method: Method = "gp-sim-posterior", history: int | None = None, model_steps: int | None = None,
-    updates: int = 30000, seed: int = 0, device: Device | None = None, place: bool = True,
-    resume: Path | str | None = None, out: Path | str = "runs", name: str = "learn", rerun: bool = True,
+    episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile | None = None,
+    method: Method | None = None, history: int | None = None, model_steps: int | None = None,
+    updates: int | None = None, seed: int | None = None, device: Device | None = None, place: bool | None = None,
+    resume: Path | str | None = None, out: Path | str | None = None, name: str | None = None, rerun: bool | None = None,
     live: bool = False, viewer: str | None = None, vehicle: str | Path | CarFile | None = None,
     reality: str | Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
     hooks: LearnHooks | None = None,
@@ -150,21 +149,21 @@ def learn(
         track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
         ticks: control periods per episode; by default the task's number.
-        prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model. ``auto`` starts
-            with the nominal one; between episodes, effects and parameters that the recordings support are added to it,
-            and those that the recordings contradict are removed.
-        method: ``gp-sim-posterior``; ``gp-posterior`` without a simulator; ``sim-fsvgd``, ``sim-fsvgd-corrected`` and
-            ``fsvgd`` are the paper's algorithms with its settings.
+        prior: the prior simulator: ``kinematic`` (the default), ``nominal``, or a car file such as a diagnosed model.
+            ``auto`` starts with the nominal one; between episodes, effects and parameters that the recordings support
+            are added to it, and those that the recordings contradict are removed.
+        method: ``gp-sim-posterior`` (the default); ``gp-posterior`` without a simulator; ``sim-fsvgd``,
+            ``sim-fsvgd-corrected`` and ``fsvgd`` are the paper's algorithms with its settings.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
         model_steps: optimiser steps of the model before each episode; 2500 by default.
-        updates: gradient steps of the policy before an episode.
-        seed: of all random numbers.
+        updates: gradient steps of the policy before an episode; 30 000 by default.
+        seed: of all random numbers; 0 by default.
         device: of the training of model and policy; ``cpu`` by default.
-        place: start each episode at the task's start pose; False: at the car's current pose.
-        resume: folder of a run to resume.
-        out: parent of the run's folder.
-        name: last part of the run folder's name.
-        rerun: also record .rrd files.
+        place: True, the default: start each episode at the task's start pose; False: at the car's current pose.
+        resume: folder of a run to resume; only ``episodes``, ``device``, ``ray``, ``live`` and ``viewer`` may change.
+        out: parent of the folder of a new run; ``runs`` by default.
+        name: last part of the name of this folder; ``learn`` by default.
+        rerun: True, the default: also record .rrd files.
         live: as for ``carlab.drive``.
         viewer: as for ``carlab.drive``.
         vehicle: as for ``carlab.drive``.
@@ -181,11 +180,16 @@ def learn(
         ConfigError, DataError: an argument is invalid or differs from the run to resume, or training failed.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
-    present = cast("Method", current_method(method))
+    options: dict[str, Any] = {
+        "ticks": ticks, "prior": prior, "method": None if method is None else current_method(method),
+        "history": history, "model_steps": model_steps, "updates": updates, "seed": seed, "place": place,
+        "out": None if out is None else Path(out), "name": name, "rerun": rerun,
+    }  # fmt: skip
+    given = {option: value for option, value in options.items() if value is not None}
     return _learn(LearnRequest(
-        car, episodes, ticks, prior, present, history, model_steps, updates, seed, device, place,
-        None if resume is None else Path(resume), Path(out), name, rerun, live, viewer, vehicle, reality, dry_run,
-        task, track, ray, ray_wait,
+        car=car, task=task, track=track, episodes=episodes, device=device,
+        resume=None if resume is None else Path(resume), live=live, viewer=viewer, vehicle=vehicle, reality=reality,
+        dry_run=dry_run, ray=ray, ray_wait=ray_wait, **given, given=frozenset(given),
     ), hooks or LearnHooks())  # fmt: skip
 
 
@@ -358,18 +362,26 @@ def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack:
 
 def _check_as_before(request: LearnRequest, campaign: Campaign, choice: CarChoice) -> None:
     """Raise ConfigError for a given argument that differs from the run to resume."""
+    for name in ("out", "name"):
+        if name in request.given:
+            raise ConfigError(f"--{name}: a resumed run stays in its folder; remove the option.")
     plan = campaign.plan
-    default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
     saved = {name: getattr(plan, name) for name in PLAN_ARGUMENTS}
-    changed = [n for n in PLAN_ARGUMENTS if getattr(request, n) not in (default[n], saved[n])]
+    saved |= {"place": campaign.place, "rerun": campaign.record_rerun}
+    for name, value in saved.items():
+        if name in request.given and getattr(request, name) != value:
+            start = "without it" if value is None else f"with {_option(name, value)}"
+            raise ConfigError(
+                f"{_option(name, getattr(request, name))}: this run was started {start}; remove the option, or start "
+                "a new run."
+            )
     is_same = campaign.corrects_prior == (request.prior == AUTO)
-    if request.prior != default["prior"] and not (
-        is_same and training_plan(request, choice).prior_toml == plan.prior_toml
-    ):
+    if "prior" in request.given and not (is_same and training_plan(request, choice).prior_toml == plan.prior_toml):
         raise ConfigError("--prior: this run was started with another prior; remove the option, or start a new run.")
-    if changed:
-        option = changed[0].replace("_", "-")
-        raise ConfigError(
-            f"--{option} {getattr(request, changed[0])}: this run was started with {saved[changed[0]]}; remove the "
-            "option, or start a new run."
-        )
+
+
+def _option(name: str, value: Any) -> str:
+    """An argument as a command-line option."""
+    if isinstance(value, bool):
+        return f"--{name}" if value else f"--no-{name}"
+    return f"--{name.replace('_', '-')} {value}"

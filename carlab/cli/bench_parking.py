@@ -85,10 +85,11 @@ def _drive_here(runs: Sequence[_Run], started: Mapping[str, Path], options: Benc
     for run in runs:
         console.print(f"{run.label}, seed {run.seed}")
         reality = write_reality(run.reality, options.runs / "realities") if run.reality else None
+        folder = started.get(run.name)
+        place: dict[str, Any] = {"out": options.runs, "name": run.name} if folder is None else {"resume": folder}
         code = Learn(
             CarOptions("sim", reality=reality), episodes=options.episodes, updates=options.updates,
-            model_steps=options.steps, seed=run.seed, device=options.device, resume=started.get(run.name),
-            out=options.runs, name=run.name, rerun=False, **run.options,
+            model_steps=options.steps, seed=run.seed, device=options.device, rerun=False, **place, **run.options,
         ).run()  # fmt: skip
         if code != 0:
             return code
@@ -131,10 +132,12 @@ def _job(run: _Run, started: Path | None, options: BenchOptions) -> ChildJob:
         reality = write_reality(run.reality, options.runs / "realities")
         files[reality.name] = reality.read_bytes()
         command += ["--reality", reality.name]
-    if started is not None:
+    if started is None:
+        command += ["--out", RUNS, "--name", run.name]
+    else:
         files |= {f"{RUNS}/{name}": content for name, content in read_files(started.parent, started.name).items()}
         command += ["--resume", f"{RUNS}/{started.name}"]
-    given = {"episodes": options.episodes, "updates": options.updates, "seed": run.seed, "out": RUNS, "name": run.name}
+    given = {"episodes": options.episodes, "updates": options.updates, "seed": run.seed}
     given |= run.options | ({} if options.steps is None else {"model-steps": options.steps})
     command += [word for name, value in given.items() for word in (f"--{name}", str(value))]
     return ChildJob(tuple(command), math.inf, files, (RUNS,), environment=ONE_THREAD)

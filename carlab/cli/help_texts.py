@@ -49,17 +49,19 @@ def _omit_empty_defaults(option_class: type) -> None:
         value_type, *markers = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
         if not is_dataclass(value_type):
             given = next((each for each in markers if isinstance(each, _SETTINGS)), tyro.conf.arg())
-            others = (each for each in markers if each is not given)
-            own[name] = Annotated[value_type, *others, _without_empty_default(given, value_type)]
+            others = [each for each in markers if each is not given]
+            placeholder = None if _DISALLOW_NONE in others else _metavar(value_type)
+            own[name] = Annotated[value_type, *others, _without_empty_default(given, placeholder)]
 
 
 _SETTINGS = type(tyro.conf.arg())
+_DISALLOW_NONE = get_args(tyro.conf.DisallowNone[int])[1]
+"""Marker of a flag that may be absent."""
 
 
-def _without_empty_default(settings: Any, value_type: Any) -> Any:
+def _without_empty_default(settings: Any, placeholder: str | None) -> Any:
     """Settings of an option in tyro, with a placeholder for its value and a text for its default."""
-    metavar = settings.metavar or _metavar(value_type)
-    return replace(settings, metavar=metavar, help_behavior_hint=_default_text)
+    return replace(settings, metavar=settings.metavar or placeholder, help_behavior_hint=_default_text)
 
 
 def _metavar(hint: Any) -> str | None:

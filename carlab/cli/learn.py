@@ -7,10 +7,10 @@ import math
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from rich.progress import Progress, TaskID
-from tyro.conf import OmitArgPrefixes
+from tyro.conf import DisallowNone, OmitArgPrefixes, arg
 
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
 from carlab.api.runs import figure_names
@@ -70,17 +70,17 @@ class Learn:
     ticks: int | None = None
     """Ticks per episode, more than --history; by default the task's number (parking: 100)."""
 
-    prior: str = "kinematic"
-    """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), auto, or FILE.toml (for
-    example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and parameters that the
-    recordings support are added to the prior, and those that they contradict are removed; the run prints each change.
-    Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle lie within 30 % of
-    their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
+    prior: str | None = None
+    """The prior simulator: kinematic (the default: the car file without wheel slip), nominal (the car file), auto, or
+    FILE.toml (for example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and
+    parameters that the recordings support are added to the prior, and those that they contradict are removed; the run
+    prints each change. Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle
+    lie within 30 % of their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
 
-    method: Method = "gp-sim-posterior"
-    """gp-sim-posterior: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method).
-    gp-posterior: the same without a simulator. sim-fsvgd: the paper's algorithm as in the authors' public code, with
-    the simulator prior; sim-fsvgd-corrected: without the errors of that code; fsvgd: the paper's, without a
+    method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = None
+    """gp-sim-posterior (the default): particles fitted to a Gaussian-process posterior around the simulator (carlab's
+    own method). gp-posterior: the same without a simulator. sim-fsvgd: the paper's algorithm as in the authors' public
+    code, with the simulator prior; sim-fsvgd-corrected: without the errors of that code; fsvgd: the paper's, without a
     simulator."""
 
     history: int | None = None
@@ -91,13 +91,13 @@ class Learn:
     model_steps: int | None = None
     """Steps of the model's optimiser before each episode: 2500 by default (the paper's methods: at most 40 000)."""
 
-    updates: int = 30000
-    """Gradient steps of SAC before an episode. Before the first episode the number is 1.5 times as large; after the
-    third it is multiplied by 3 / episode."""
+    updates: int | None = None
+    """Gradient steps of SAC before an episode, 30 000 by default. Before the first episode the number is 1.5 times as
+    large; after the third it is multiplied by 3 / episode."""
 
-    seed: int = 0
-    """Seed of all random numbers. The same seed gives the same run. Exceptions: a resumed run, whose times
-    have other rounding errors; with --prior auto a run after its first diagnosis, which has a time limit."""
+    seed: int | None = None
+    """Seed of all random numbers, 0 by default. The same seed gives the same run. Exceptions: a resumed run, whose
+    times have other rounding errors; with --prior auto a run after its first diagnosis, which has a time limit."""
 
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""
@@ -112,22 +112,22 @@ class Learn:
     ray_wait: float = RAY_WAIT_S
     """Time without an answer of the cluster after which a training runs on this computer [s]."""
 
-    place: bool = True
-    """Start each episode at the task's start pose, at which a person places a real car; off: at the car's current
-    pose."""
+    place: DisallowNone[bool | None] = None
+    """Start each episode at the task's start pose, at which a person places a real car (the default); off: at the car's
+    current pose."""
 
     resume: Path | None = None
-    """Run folder to resume. --car must be the same, --episodes and --device may change, and all other options are those
-    of the run."""
+    """Run folder to resume. --car must be the same; --episodes, --device, --ray, --live and --viewer may change, and
+    all other options are those of the run."""
 
-    out: Path = Path("runs")
-    """Parent of the run's folder."""
+    out: Path | None = None
+    """Parent of the folder of a new run; runs by default."""
 
-    name: str = "learn"
-    """Last part of the run folder's name."""
+    name: str | None = None
+    """Last part of the name of this folder; learn by default."""
 
-    rerun: bool = True
-    """Also record .rrd files."""
+    rerun: DisallowNone[bool | None] = None
+    """Also record .rrd files (the default)."""
 
     live: bool = False
     """Open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it."""

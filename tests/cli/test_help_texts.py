@@ -53,6 +53,7 @@ def test_option_without_default_has_the_type_of_its_value_only(verb: str, capsys
         run([verb, "--help"])
     printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "None" not in printed
+    assert "BOOL, --no-" not in printed, "a flag has no value"
     assert "default: )" not in printed
     assert "default: '')" not in printed
     assert printed.count("(default: ") >= 1

@@ -90,7 +90,7 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
         ("--model-steps 0", "--model-steps 0: give a number above zero."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),
         ("--car nosuch", "There is no car 'nosuch'"),
-        ("--method guessing", "'gp-sim-posterior', 'gp-posterior'"),
+        ("--method guessing", "--method guessing: choose one of gp-sim-posterior, gp-posterior, sim-fsvgd,"),
     ],
 )
 def test_invalid_options_are_refused_and_write_nothing(
@@ -127,9 +127,15 @@ def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Pat
     [
         (
             "--method fsvgd",
-            "--method fsvgd: this run was started with gp-sim-posterior; remove the option, or start a",
+            "--method fsvgd: this run was started with --method gp-sim-posterior; remove the option, or start a",
         ),
-        ("--seed 7", "--seed 7: this run was started with"),
+        ("--seed 7", "--seed 7: this run was started with --seed 0; remove the option, or start a new run."),
+        ("--updates 30000", "--updates 30000: this run was started with --updates 32; remove the option"),
+        ("--model-steps 2500", "--model-steps 2500: this run was started with --model-steps 40; remove the option"),
+        ("--rerun", "--rerun: this run was started with --no-rerun; remove the option"),
+        ("--no-place", "--no-place: this run was started with --place; remove the option"),
+        ("--out runs", "--out: a resumed run stays in its folder; remove the option."),
+        ("--name learn", "--name: a resumed run stays in its folder; remove the option."),
         ("--prior nominal", "--prior: this run was started with another prior; remove the option, or start a new"),
         ("--prior auto", "--prior: this run was started with another prior; remove the option, or start a new"),
     ],
