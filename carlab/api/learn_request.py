@@ -78,7 +78,7 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
     if history is None:
         history = PAPER_HISTORY if request.method in PAPER_METHODS else needed_history(choice.simulator)
     task_choice = given_task(request.task, request.track, choice.track) or PARKING
-    task = load_checked(task_choice, choice.envelope.arena_m)
+    task = load_checked(task_choice, choice.envelope.arena_m).at_period(choice.control_period_s)
     check_trainable(task_choice)
     _check_extent(task)
     if (ticks := request.ticks or task.max_ticks) <= history:

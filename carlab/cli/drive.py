@@ -45,8 +45,8 @@ class Drive:
     """Number of episodes."""
 
     ticks: int | None = None
-    """Ticks per episode. By default the task's number (parking: 100); for a scripted manoeuvre its duration; for
-    excitation a minute; with keyboard or gamepad no limit."""
+    """Ticks per episode. By default the task's number (parking: 100 at 30 Hz); for a scripted manoeuvre its duration;
+    for excitation a minute; with keyboard or gamepad no limit."""
 
     seed: int = 0
     """Seed of start poses, sensor noise, and the commands of excitation."""

@@ -68,7 +68,7 @@ class Learn:
     """Total number of episodes, including those already driven; by default 20, or the number of the resumed run."""
 
     ticks: int | None = None
-    """Ticks per episode, more than --history; by default the task's number (parking: 100)."""
+    """Ticks per episode, more than --history; by default the task's number (parking: 100 at 30 Hz)."""
 
     prior: str | None = None
     """The prior simulator: kinematic (the default: the car file without wheel slip), nominal (the car file), auto, or

@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -39,8 +39,9 @@ DEFAULT_TRACK = oval_track()
 class _ClosedPathTask(Task):
     """A task along a closed path.
 
-    reward = progress / (speed * period) - offset_weight (offset / limit)^2 - action_cost |a|^2. The episode ends
-    further than the limit from the path, which costs 1. Success is at least one lap without that.
+    reward = progress / (speed * period) - tick_weight (offset_weight (offset / limit)^2 + action_cost |a|^2), with the
+    period of 30 Hz at each rate. The episode ends further than the limit from the path, which costs 1. Success is at
+    least one lap without that.
     """
 
     speed_mps: float = 1.0
@@ -49,6 +50,7 @@ class _ClosedPathTask(Task):
     action_cost: float = 0.005
     history_length: int = 3
     max_ticks: int = 300
+    tick_weight: float = 1.0
     cost_weight: float = 10.0
 
     @property
@@ -82,6 +84,10 @@ class _ClosedPathTask(Task):
         turn, speed_mps = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(0.0, 1.5))
         return CarState(x0 - left * math.sin(course), y0 + left * math.cos(course), course + turn, speed_mps)
 
+    def at_period(self, period_s: float) -> Self:
+        """The task at a control period [s], with the same duration and sum of rewards."""
+        return self._at_tick_weight(period_s)
+
     def reward(self, features: Any, action: Any, next_features: Any) -> Any:
         """Reward (...,) of transitions."""
         xp = array_namespace(next_features)
@@ -90,8 +96,8 @@ class _ClosedPathTask(Task):
         progress_m = wrap_length(after.arc_m - arc_m, self.path.length_m)
         return (
             progress_m / (self.speed_mps * self.period_s)
-            - self.offset_weight * (after.distance_m / after.value_m) ** 2
-            - self.action_cost * xp.sum(action**2, axis=-1)
+            - self.tick_weight * self.offset_weight * (after.distance_m / after.value_m) ** 2
+            - self.tick_weight * self.action_cost * xp.sum(action**2, axis=-1)
         )
 
     def terminated(self, next_features: Any) -> Any:

@@ -29,6 +29,10 @@ START_MARGIN_M = 0.4
 """Smallest distance of a random start from the edge of the arena."""
 MAX_START_DRAWS = 1000
 """Number of random starts in keep-out shapes after which the shapes count as covering the arena."""
+REFERENCE_RATE_HZ = 30.0
+"""Control rate at which carlab's tasks state rewards and costs of a tick and the number of ticks."""
+TICK_WEIGHT_DIGITS = 4
+"""Decimals of the duration of a tick in reference ticks, so that 0.0333333333 s is one."""
 
 
 class Task(ABC):
@@ -117,14 +121,32 @@ class Task(ABC):
         """The result of an episode in a few words, for the console."""
         return "success" if summary["success"] else "no success"
 
+    def at_period(self, period_s: float) -> Self:
+        """The task at a control period [s]; by default the task itself, whose rewards and ticks are of any period.
+
+        carlab's tasks have episodes of the same duration, and rewards and costs of the same sum, at each period.
+        """
+        return self
+
     def resized(self, history_length: int, max_ticks: int | None = None) -> Self:
         """Copy with another number of past actions, and of ticks if given.
 
         Raises:
             ConfigError: the task does not let a run set them, for example because one is a property.
         """
+        ticks = {} if max_ticks is None else {"max_ticks": max_ticks}
+        return self._changed({"history_length": history_length, **ticks})
+
+    def _at_tick_weight(self, period_s: float) -> Self:
+        """Copy whose ``tick_weight`` is the duration of a tick in reference ticks, with the same duration."""
+        weight = round(period_s * REFERENCE_RATE_HZ, TICK_WEIGHT_DIGITS)
+        if weight == 1.0:
+            return self
+        return self._changed({"tick_weight": weight, "max_ticks": max(round(self.max_ticks / weight), 1)})
+
+    def _changed(self, values: Mapping[str, float]) -> Self:
+        """Copy with other attributes. Raises ConfigError if one cannot be set."""
         changed = copy.copy(self)
-        values = {"history_length": history_length} | ({} if max_ticks is None else {"max_ticks": max_ticks})
         for name, value in values.items():
             try:
                 object.__setattr__(changed, name, value)
@@ -150,9 +172,10 @@ def long_tail_tolerance(distance: Any, bound: float, margin: float, value_at_mar
 class ParkingTask(Task):
     """Reverse parking of Rothfuss et al., arXiv 2403.16644: about 1.8 m away, turned by 180 degrees, 100 ticks.
 
-    Reward: tolerance of d = sqrt(|position error|^2 + yaw error^2) [m and rad mixed, as the paper does] with bound 0.1
-    and margin 2, minus 0.005 |a|^2. Start: pose (1.42, -1.04, pi) +- (0.1 m, 0.1 m, 0.1 pi), velocities with standard
-    deviations (0.005, 0.005 m/s, 0.02 rad/s). The car counts as parked within 0.2 m and 0.35 rad, slower than 0.3 m/s.
+    Reward at 30 Hz: tolerance of d = sqrt(|position error|^2 + yaw error^2) [m and rad mixed, as the paper does] with
+    bound 0.1 and margin 2, minus 0.005 |a|^2; ``tick_weight`` multiplies it at other rates. Start: pose (1.42, -1.04,
+    pi) +- (0.1 m, 0.1 m, 0.1 pi), velocities with standard deviations (0.005, 0.005 m/s, 0.02 rad/s). The car counts as
+    parked within 0.2 m and 0.35 rad, slower than 0.3 m/s.
     """
 
     goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -168,6 +191,7 @@ class ParkingTask(Task):
     stop_when_parked: bool = False
     history_length: int = 3
     max_ticks: int = 100
+    tick_weight: float = 1.0
     arena_m: Corners = PAPER_ARENA_M
     name: str = "parking"
 
@@ -176,6 +200,10 @@ class ParkingTask(Task):
         pose = np.asarray(self.start_pose) + rng.uniform(-1.0, 1.0, 3) * np.asarray(self.start_spread)
         velocity = rng.normal(0.0, self.start_velocity_std)
         return CarState(float(pose[0]), float(pose[1]), float(wrap(pose[2])), *(float(v) for v in velocity))
+
+    def at_period(self, period_s: float) -> Self:
+        """The task at a control period [s], with the same duration and sum of rewards."""
+        return self._at_tick_weight(period_s)
 
     def errors(self, features: Any) -> tuple[Any, Any]:
         """Distance to the goal [m] and wrapped yaw error [rad], each (...,)."""
@@ -189,7 +217,8 @@ class ParkingTask(Task):
         xp = array_namespace(next_features)
         distance, yaw_error = self.errors(next_features)
         total = xp.sqrt(distance * distance + yaw_error * yaw_error + 1e-12)
-        return long_tail_tolerance(total, self.bound, self.margin) - self.action_cost * xp.sum(action**2, axis=-1)
+        tolerance = long_tail_tolerance(total, self.bound, self.margin)
+        return self.tick_weight * (tolerance - self.action_cost * xp.sum(action**2, axis=-1))
 
     def success(self, features: Any) -> Any:
         """Whether the car is parked, booleans (...,)."""
@@ -226,7 +255,7 @@ class ParkingTask(Task):
 class ObstacleParkingTask(ParkingTask):
     """Reverse parking behind four discs, from the authors' safe-learning work (github lasgroup/safe-learning).
 
-    The cost of a tick is the car's kinetic energy [J] while its reference point is inside a disc
+    The cost of a tick at 30 Hz is the car's kinetic energy [J] while its reference point is inside a disc
     (ss2r/benchmark_suites/rccar/rccar.py there; discs of ss2r/configs/environment/rccar.yaml). Differences: the discs
     do not push the car back, reward and start are those of ``ParkingTask``, and an episode has 200 ticks, not 250.
     """
@@ -256,9 +285,9 @@ class ObstacleParkingTask(ParkingTask):
         raise ConfigError("the keep-out shapes cover the arena; make them smaller")
 
     def cost(self, next_features: Any) -> Any:
-        """Kinetic energy [J] inside a disc, zero outside."""
+        """Kinetic energy [J] inside a disc, times ``tick_weight``; zero outside."""
         energy_j = 0.5 * self.mass_kg * (next_features[..., 4] ** 2 + next_features[..., 5] ** 2)
-        return energy_j * Task.cost(self, next_features)
+        return self.tick_weight * energy_j * Task.cost(self, next_features)
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,3 +156,12 @@ def test_driving_outside_the_main_thread_is_refused(tmp_path: Path, call: Callab
     assert isinstance(error, ConfigError)
     assert "call carlab in the main thread, or in a process of its own." in str(error)
     assert not list(tmp_path.iterdir())
+
+
+def test_default_episode_has_the_same_duration_at_another_control_rate(tmp_path: Path) -> None:
+    """The control period of dart_jetracer is 0.1 s."""
+    slow = carlab.drive("dart_jetracer", policy="neutral", out=tmp_path, rerun=False, picture=False)
+    fast = drive(tmp_path, ticks=None, picture=False)
+    ticks = [run.episodes[0].data.ticks for run in (slow, fast)]
+    assert ticks == [33, 100]
+    assert slow.episodes[0].total_reward == pytest.approx(fast.episodes[0].total_reward, rel=0.1)

@@ -55,6 +55,28 @@ def test_parking_reward_is_the_paper_s_closed_form() -> None:
     assert task.reward(features_of(turned), np.zeros((1, 2)), features_of(turned))[0] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("task", [ParkingTask(), ObstacleParkingTask(), PathTask(), LapTask()], ids=lambda t: t.name)
+def test_sums_of_rewards_and_costs_are_the_same_at_each_control_rate(task: Task) -> None:
+    """A car drives at 0.3 m/s from (0.1, -0.15) along y = -0.15, through a disc of ObstacleParkingTask."""
+    sums = []
+    for rate_hz in (30.0, 10.0, 60.0):
+        own = task.at_period(1.0 / rate_hz)
+        states = np.tile([0.1, -0.15, 0.1, 0.3, 0.0, 0.0], (own.max_ticks + 1, 1))
+        states[:, 0] += 0.3 * np.arange(len(states)) / rate_hz
+        features, actions = features_of(states), np.tile([0.5, 0.5], (own.max_ticks, 1))
+        reward, cost = own.reward(features[:-1], actions, features[1:]), own.cost(features[1:])
+        assert own.max_ticks / rate_hz == pytest.approx(task.max_ticks / 30.0, abs=0.5 / rate_hz)
+        sums.append((float(reward.sum()), 0.0 if isinstance(task, (PathTask, LapTask)) else float(cost.sum())))
+    assert sums[1] == pytest.approx(sums[0], rel=0.04)
+    assert sums[2] == pytest.approx(sums[0], rel=0.04)
+
+
+def test_a_rounded_period_of_30_hz_does_not_change_a_task() -> None:
+    for task in (ParkingTask(), LapTask()):
+        assert task.at_period(0.0333333333) is task
+        assert task.at_period(0.033333) is task
+
+
 @pytest.mark.parametrize("task", [ObstacleParkingTask(), PathTask(), LapTask()], ids=lambda task: task.name)
 def test_numpy_and_torch_give_the_same_reward(task: Task, rng: np.random.Generator) -> None:
     before, after = (features_of(rng.uniform(-2, 2, (200, 6))) for _ in range(2))

@@ -8,12 +8,10 @@ from pathlib import Path
 from carlab.core.errors import DataError
 from carlab.core.observation import ACTION_SIZE, STATE_FEATURES, feature_size
 from carlab.core.policy import Policy
-from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.campaign import saved_plan
 from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
-from sim_backends.car_parameters import SimulatorConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +33,7 @@ class LearnedPolicy:
     @property
     def control_period_s(self) -> float:
         """Control period of the training [s]."""
-        return SimulatorConfig.from_tables(toml_tables(self.plan.prior_toml)).control_period_s
+        return self.plan.control_period_s
 
 
 def load_policy(folder: Path) -> LearnedPolicy:

@@ -182,7 +182,7 @@ def _environments(
     from learning.world import model_env
 
     task = plan.task
-    period_s = SimulatorConfig.from_tables(toml_tables(plan.prior_toml)).control_period_s
+    period_s = plan.control_period_s
     reaction_s = min(envelope.reaction_s + EXTRA_REACTION_S, SAFETY_BOUNDS.deadline.high)
     slow_gate = replace(envelope, reaction_s=reaction_s)
     gate: dict[str, Any] = {"envelope": slow_gate, "period_s": period_s, "device": plan.device}
@@ -207,7 +207,7 @@ def _predicted_figures(
     """``predicted_figures`` for the learned car with the safety gate of the driven car."""
     from learning.world.model_env import ModelEnv
 
-    period_s = SimulatorConfig.from_tables(toml_tables(plan.prior_toml)).control_period_s
+    period_s = plan.control_period_s
     learned = ModelEnv(
         dynamics, plan.task, N_EVALUATION_CARS, envelope=envelope, period_s=period_s, seed=seed + 2, device=plan.device
     )

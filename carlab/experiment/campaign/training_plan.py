@@ -11,8 +11,10 @@ from carlab.core.method_names import current_method
 from carlab.core.seeds import MAX_SEED
 from carlab.core.task import Task
 from carlab.core.task_choice import PARKING, TaskChoice
+from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
 from learning.world.car_fit import Method
+from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +57,13 @@ class TrainingPlan:
 
     @property
     def task(self) -> Task:
-        """The task with the history of the model and the ticks of this run."""
-        return self.task_choice.load().resized(self.history, self.ticks)
+        """The task at the control period of the prior, with the history of the model and the ticks of this run."""
+        return self.task_choice.load().at_period(self.control_period_s).resized(self.history, self.ticks)
+
+    @property
+    def control_period_s(self) -> float:
+        """Control period of the prior [s]."""
+        return SimulatorConfig.from_tables(toml_tables(self.prior_toml)).control_period_s
 
     def updates_before(self, episode: int) -> int:
         """Gradient steps of SAC before an episode: 1.5 times ``updates`` before the first, 3 / episode after the third.

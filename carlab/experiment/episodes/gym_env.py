@@ -145,5 +145,5 @@ def make_env(task: str = "parking", vehicle: str | Path | None = None) -> CarEnv
         return choose_car("sim", vehicle=None if vehicle is None else Path(vehicle), seed=seed).car
 
     period_s = choose_car("sim", vehicle=None if vehicle is None else Path(vehicle), seed=0).control_period_s
-    chosen_task: Task = TASKS[task]()
+    chosen_task: Task = TASKS[task]().at_period(period_s)
     return CarEnv(car_of_seed, chosen_task, period_s)
