@@ -33,7 +33,7 @@ def given_task(task: str | Task | None, track: Path | str | None, car_track: Tra
     if task is None and track is None:
         return None
     given = None if track is None else read_track(track)
-    return choose_task(task or "laps", given or (car_track if task == "laps" else None))
+    return choose_task("laps" if task is None else task, given or (car_track if task == "laps" else None))
 
 
 def check_trainable(choice: TaskChoice) -> None:

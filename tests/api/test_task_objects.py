@@ -67,3 +67,8 @@ def test_task_beyond_the_observed_positions_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"coordinate of 25 m; a learned policy observes positions up to 20 m"):
         carlab.learn("sim", task=Far(), episodes=1, out=tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
+
+
+def test_empty_name_of_a_task_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--task : choose one of parking"):
+        carlab.drive("sim", task="", policy="neutral", ticks=2, out=tmp_path)
