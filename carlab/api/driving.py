@@ -301,11 +301,11 @@ def _task_to_drive(chosen: TaskChoice, choice: CarChoice) -> Task:
     """The task, checked; not carlab's parking and a recorded task, because such a drive may start at another place."""
     from carlab.core.task import ParkingTask, RecordedTask
 
-    task = chosen.load().at_period(choice.control_period_s)
+    task = chosen.load()
     is_unchecked = isinstance(task, RecordedTask) or (isinstance(task, ParkingTask) and not chosen.sha256)
     if not is_unchecked:
         load_checked(chosen, choice.envelope.arena_m)
-    return task
+    return task.at_period(choice.control_period_s)
 
 
 def _without_arena(policy: str | Policy, task: Task, choice: CarChoice) -> Task:

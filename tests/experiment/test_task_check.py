@@ -73,6 +73,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ),
     ({"resized": lambda self, history, ticks=None: self}, "must return the task with history_length 4"),
     ({"resized": lambda self, history, ticks=None: None}, "must return the task with history_length 4"),
+    ({"at_period": lambda self, period_s: None}, r"at_period\(0.1\) must return a task"),
+    ({"at_period": lambda self, period_s: 1 // 0}, "at_period raises ZeroDivisionError"),
     ({"goal": (100.0, 0.0, 0.0)}, "the goal .* is outside the arena; positions are in metres"),
     ({"goal": (1.0, 0.0, 90.0)}, "yaw of 90; angles are in radians"),
     ({"goal": (1.0, 0.0)}, "goal is"),

@@ -23,6 +23,8 @@ MAX_REWARD, MAX_SPEED_MPS, MAX_POSITION_M = 100.0, 20.0, 1000.0
 TORCH_TOLERANCE = 1e-3
 """Relative difference of float32 from float64."""
 MAX_TICKS = 10**6
+OTHER_PERIOD_S = 0.1
+"""A control period other than that of carlab's tasks."""
 _METRES = "positions are in metres"
 _ATTRIBUTES = (
     *("name", "history_length", "max_ticks", "cost_weight"),
@@ -99,6 +101,8 @@ def _check_attributes(task: Task) -> None:
     outlines = values["outlines_m"]
     if not isinstance(outlines, (tuple, list)) or not all(map(_are_points, outlines)):
         raise _error(task, "outlines_m must be a tuple of lines, each a tuple of points (x, y) in metres")
+    if not isinstance(_call(task, "at_period", task.at_period, OTHER_PERIOD_S), Task):
+        raise _error(task, f"at_period({OTHER_PERIOD_S}) must return a task")
     longer = values["history_length"] + 1
     resized = _call(task, "resized", task.resized, longer)
     if not isinstance(resized, Task) or resized.history_length != longer:
