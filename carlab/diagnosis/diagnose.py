@@ -150,17 +150,22 @@ def _prepare_recordings(
     nominal = request.nominal
     progress("reading", 0.0)
     recorded_s = sum(len(e.times_s) * e.period_s for e in fit if e.ticks)
-    fit, held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
+    repaired_fit, repaired_held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
     faults = (*request.data_faults, *own_faults)
     progress("reading", 0.03)
     try:
         with naming_lost_frames((*fit, *held_out)):
             recordings = split_recordings(
-                fit, held_out, request.held_out_share, nominal, request.settings, keep_events=request.keep_events
+                repaired_fit,
+                repaired_held_out,
+                request.held_out_share,
+                nominal,
+                request.settings,
+                keep_events=request.keep_events,
             )
     except Inconclusive as error:
         error.data_faults = faults
-        usable_s = sum(segment.duration_s for segment in segments_of(fit))
+        usable_s = sum(segment.duration_s for segment in segments_of(repaired_fit))
         if faults and usable_s < settings.min_fit_s and usable_s < settings.unusable_share * recorded_s:
             error.verdict = "data"
         raise

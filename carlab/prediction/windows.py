@@ -186,10 +186,11 @@ def segments_of(episodes: Sequence[EpisodeData], period_s: float | None = None) 
 
 
 def unbroken_rows(episode: EpisodeData) -> Iterable[slice]:
-    """Stretches of a recording without gaps, missing values and changes of the column ``segment``."""
+    """Stretches of a recording without gaps, missing numbers and changes of the column ``segment``."""
     t = episode.times_s
-    whole = np.asarray(np.isfinite(episode.states).all(axis=1))
-    broken = np.asarray(np.diff(t) > max(3.0 * episode.period_s, 0.1)) | ~(whole[1:] & whole[:-1])
+    is_whole = np.asarray(np.isfinite(episode.states).all(axis=1))
+    is_whole[:-1] &= np.isfinite(episode.sent).all(axis=1)
+    broken = np.asarray(np.diff(t) > max(3.0 * episode.period_s, 0.1)) | ~(is_whole[1:] & is_whole[:-1])
     if "segment" in episode.extra:
         broken = broken | np.asarray(np.diff(episode.extra["segment"]) != 0)
     edges = [0, *(np.flatnonzero(broken) + 1), len(t)]

@@ -9,12 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.quantities import FloatArray
+from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault
+from carlab.diagnosis.state_alignment import STATE_AGE
+from carlab.recording.column_mapping import COMMAND_CHANNELS
 from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.robust import held_means
 from carlab.recording.faults.stamps import gap_rows, segments
 from carlab.recording.pose_velocity import BoolArray, PoseMotion, pose_jumps, pose_motion
+
+MIN_ROWS = 60
+"""Minimum number of rows of a recording to check: 2 s at 30 Hz."""
 
 
 @dataclass(slots=True)
@@ -63,8 +68,8 @@ class EpisodeRepair:
 
     @property
     def usable(self) -> bool:
-        """Whether there is enough to check: 2 s of rows at 30 Hz, all numbers finite."""
-        return len(self.times_s) >= 60 and bool(np.isfinite(self.states).all() and np.isfinite(self.commands).all())
+        """Whether there are enough rows to check, with all numbers finite."""
+        return len(self.times_s) >= MIN_ROWS and not _missing_numbers(self.episode)[self.rows].any()
 
     def motion(self) -> PoseMotion:
         """Motion estimated from the pose."""
@@ -77,6 +82,20 @@ class EpisodeRepair:
         jumps = np.setdiff1d(pose_jumps(self.times_s, *self.states.T[:3]), gaps)
         self.segment = segments(len(self.times_s), np.union1d(gaps, jumps))
         return len(jumps)
+
+    def leave_out_incomplete_rows(self) -> None:
+        """Remove rows with missing numbers if enough rows remain, and report them unless their frames are lost."""
+        missing = _missing_numbers(self.episode)
+        is_incomplete = np.asarray(missing.any(axis=1))
+        if not is_incomplete.any():
+            return
+        if STATE_AGE not in self.episode.metadata:
+            names = ("t", *STATE_NAMES, *COMMAND_CHANNELS)
+            channels = ", ".join(name for name, column in zip(names, missing.T, strict=True) if column.any())
+            action = "reported: rows with missing numbers are left out, and the recording is cut there."
+            self.report("not_a_number", channels, is_incomplete.sum(), action)
+        if len(is_incomplete) - is_incomplete.sum() >= MIN_ROWS:
+            self.keep(~is_incomplete)
 
     def keep(self, rows: BoolArray) -> None:
         """Keep the rows of a mask (N,). The previous command is held across gaps."""
@@ -120,8 +139,10 @@ class EpisodeRepair:
             motion = self.motion()
             self.states[:, 3:] = np.column_stack([motion.vx, motion.vy, motion.yaw_rate])
         extra = {name: column[self.rows] for name, column in self.episode.extra.items() if name != "segment"}
-        if np.ptp(self.segment) > 0:
-            extra["segment"] = self.segment
+        is_incomplete = _missing_numbers(self.episode).any(axis=1)
+        segment = self.segment + np.cumsum(is_incomplete)[self.rows]
+        if np.ptp(segment) > 0:
+            extra["segment"] = segment
         poses = self.episode.poses
         if len(poses) == len(self.episode.times_s):
             poses = np.column_stack([self.times_s, self.states[:, :3]])
@@ -136,6 +157,12 @@ class EpisodeRepair:
             poses=poses,
             extra=extra,
         )
+
+
+def _missing_numbers(episode: EpisodeData) -> BoolArray:
+    """Whether stamp, states and commands of each row are missing or infinite, shape (N, 9)."""
+    commands = np.vstack([episode.sent, episode.sent[-1:]])
+    return np.asarray(~np.isfinite(np.column_stack([episode.times_s, episode.states, commands])))
 
 
 def merged(faults: Sequence[DataFault]) -> list[DataFault]:

@@ -21,7 +21,8 @@ def check(
     """Detect and repair faults of recordings.
 
     Stamps and pose are checked for consistency, velocities against the pose (kinematics only), commands against the
-    motion, and the simulator's integration step against a finer one. A plausible delay is not a fault.
+    motion, and the simulator's integration step against a finer one. A plausible delay is not a fault. Rows with
+    missing numbers are left out.
 
     Args:
         fit: recordings to fit.
@@ -35,6 +36,9 @@ def check(
         what was found. An ``action`` begins with ``repaired``, ``reported`` or ``unusable``.
     """
     repairs = [EpisodeRepair.of(episode) for episode in (*fit, *held_out)]
+    for repair in repairs:
+        if repair.episode.ticks:
+            repair.leave_out_incomplete_rows()
     usable = [repair for repair in repairs if repair.usable]
     for repair in usable:
         check_pose(repair, nominal.control_period_s)
@@ -42,7 +46,7 @@ def check(
     check_commands([repair for repair in usable if repair.usable], nominal)
     repaired = [repair.result() for repair in repairs]
     faults = merged([fault for repair in repairs for fault in repair.faults])
-    rows, sentence = lost_frames(repaired)
+    rows, sentence = lost_frames((*fit, *held_out))
     if rows:
         faults.append(DataFault("lost_frames", "x, y, yaw", rows, f"reported: {sentence}."))
     faults += check_integration(repaired[: len(fit)], nominal)
