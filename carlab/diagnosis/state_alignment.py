@@ -28,8 +28,8 @@ from sim_backends.car_parameters import LATENCY, SimulatorConfig
 HALF_WINDOW_S = 0.025
 """Half of the quadratic's window: seven poses at 120 Hz; at least two poses on each side."""
 MIN_POSES_PER_SIDE = 2
-CUBIC_HALF_WINDOW_S = 0.075
-"""Half of the window of the cubic where frames are lost; its bias is that of the widest quadratic."""
+CUBIC_HALF_WINDOWS_S = (0.075, 0.1, 0.12)
+"""Halves of windows of the cubic where frames are lost. The first one with low enough noise has the least bias."""
 MAX_LINE_POSES = 64
 MAX_AGE_MISMATCH_S = 5e-4
 """The poses of a velocity's line are identified if their mean time matches the recorded age within this."""
@@ -147,11 +147,13 @@ def _local_states(poses: FloatArray, at_s: FloatArray) -> FloatArray:
         if _has_both_sides(near, moment_s) and near[-1, 0] - near[0, 0] <= widest_s:
             states[k] = _polynomial(near, moment_s, 2)[0]
             continue
-        near = poses[np.abs(t_s - moment_s) <= CUBIC_HALF_WINDOW_S + 1e-6]
-        if _has_both_sides(near, moment_s):
-            state, gain = _polynomial(near, moment_s, 3)
-            if (gain <= max_gain).all():
-                states[k] = state
+        for half_window_s in CUBIC_HALF_WINDOWS_S:
+            near = poses[np.abs(t_s - moment_s) <= half_window_s + 1e-6]
+            if _has_both_sides(near, moment_s):
+                state, gain = _polynomial(near, moment_s, 3)
+                if (gain <= max_gain).all():
+                    states[k] = state
+                    break
     return states
 
 

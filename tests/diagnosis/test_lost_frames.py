@@ -16,7 +16,7 @@ from carlab.diagnosis.state_alignment import align_states, lost_frames
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 
-LATENCY_S, PERIOD_S, FRAME_S = 0.008, 1.0 / 30.0, 1.0 / 120.0
+LATENCY_S, PERIOD_S = 0.008, 1.0 / 30.0
 NOISE = np.array([3e-4, 3e-4, 2e-3])
 
 
@@ -31,15 +31,22 @@ def truth(t_s: np.ndarray) -> np.ndarray:
     return np.stack([x, y, yaw, vx, vy, yaw_rate], axis=1)
 
 
-def recorded(lost_share: float, seconds: float = 40.0, burst: int = 1) -> tuple[EpisodeData, float]:
-    """A recording with noisy 120 Hz poses, of which runs of ``burst`` are lost, and the exact lost share."""
+def recorded(
+    lost_share: float,
+    seconds: float = 40.0,
+    burst: int = 1,
+    *,
+    frame_hz: float = 120.0,
+    period_s: float = PERIOD_S,
+) -> tuple[EpisodeData, float]:
+    """A recording with noisy poses, of which runs of ``burst`` are lost, and the exact lost share."""
     rng = np.random.default_rng(1)
-    captures = np.arange(-30, round(seconds / FRAME_S)) * FRAME_S + 0.0021
+    captures = np.arange(-30, round(seconds * frame_hz)) / frame_hz + 0.0021
     poses = np.column_stack([captures, truth(captures)[:, :3] + NOISE * rng.normal(size=(len(captures), 3))])
     starts = rng.random(len(captures)) < 1.0 - (1.0 - lost_share) ** (1.0 / burst)
     lost = np.convolve(starts, np.ones(burst))[: len(captures)] > 0
     lost[[0, -1]] = False
-    times = np.arange(round(seconds / PERIOD_S) + 1) * PERIOD_S
+    times = np.arange(round(seconds / period_s) + 1) * period_s
     commands = np.stack([np.sin(9.0 * times[:-1]), 0.4 + 0.3 * np.cos(1.5 * times[:-1])], axis=1)
     ages = {"pose_age_s": np.full(len(times), 0.01), "velocity_delay_s": np.full(len(times), np.nan)}
     episode = EpisodeData(
@@ -60,9 +67,23 @@ def test_states_with_lost_frames_are_as_accurate_as_without(lost_share: float, m
     assert (rms_errors(broken) <= 1.05 * rms_errors(complete)).all()
 
 
-def test_a_tenth_of_lost_frames_costs_no_prediction_window() -> None:
+@pytest.mark.parametrize("period_s", [PERIOD_S, 1.0 / 60.0])
+@pytest.mark.parametrize(("lost_share", "max_missing_share"), [(0.05, 0.0), (0.1, 0.002), (0.2, 0.03)])
+def test_states_with_lost_frames_are_as_accurate_as_without_at_60_hz(
+    lost_share: float, max_missing_share: float, period_s: float
+) -> None:
     complete, broken = (
-        cut_windows(segments_of([align_states(recorded(share)[0], LATENCY_S)]), 0.8, 0.25) for share in (0.0, 0.1)
+        align_states(recorded(share, frame_hz=60.0, period_s=period_s)[0], LATENCY_S) for share in (0.0, lost_share)
+    )
+    assert np.isnan(broken.states).any(axis=1).mean() <= max_missing_share
+    assert (rms_errors(broken) <= 1.05 * rms_errors(complete)).all()
+
+
+@pytest.mark.parametrize(("frame_hz", "period_s"), [(120.0, PERIOD_S), (60.0, PERIOD_S), (60.0, 1.0 / 60.0)])
+def test_a_tenth_of_lost_frames_costs_no_prediction_window(frame_hz: float, period_s: float) -> None:
+    complete, broken = (
+        cut_windows(segments_of([align_states(episode, LATENCY_S)]), 0.8, 0.25)
+        for episode, _ in (recorded(share, frame_hz=frame_hz, period_s=period_s) for share in (0.0, 0.1))
     )
     assert len(broken) == len(complete)
 
