@@ -25,8 +25,8 @@ from carlab.core.state_estimator import MIN_SAMPLES, fit_velocity
 from carlab.recording.episode_builder import POSE_AGE, VELOCITY_DELAY
 from sim_backends.car_parameters import LATENCY, SimulatorConfig
 
-HALF_WINDOW_S = 0.025
-"""Half of the quadratic's window: seven poses at 120 Hz; at least two poses on each side."""
+HALF_WINDOW_S = 0.0251
+"""Half of the quadratic's window: seven poses at 100 Hz and 120 Hz; at least two poses on each side."""
 MIN_POSES_PER_SIDE = 2
 CUBIC_HALF_WINDOWS_S = (0.075, 0.1, 0.12)
 """Halves of windows of the cubic where frames are lost. The first one with low enough noise has the least bias."""
