@@ -36,6 +36,12 @@ MAX_PERIOD_S = 0.034
 """Maximum period of a thinned recording [s]."""
 MIN_SPEED_MPS = 0.15
 """Windows in which the car is slower [m/s] are omitted, because any model predicts a parked car."""
+MAX_JITTER_SHARE, MAX_JITTER_S = 0.1, 1e-3
+"""Maximum deviation of the time between rows from its mean, share or [s]: jitter, or stamps in whole milliseconds."""
+MAX_PERIOD_DEVIATION = 1e-3
+"""Maximum relative deviation of a segment's period from that of its grid."""
+MAX_OFFSET_SHARE = 0.02
+"""Maximum distance of rows to the grid, share of the period, up to which they are not interpolated."""
 EVENT_COLUMN = "event"
 """Column of ``EpisodeData.extra`` that is 1 in rows of events (collisions); prediction windows do not contain them."""
 BLOCK_S = 5.0
@@ -175,9 +181,10 @@ def segments_of(episodes: Sequence[EpisodeData], period_s: float | None = None) 
     for index, episode in enumerate(episodes):
         if episode.ticks < 2:
             raise DataError(f"Recording {index + 1} has too few commands ({episode.ticks}); record at least 10 s.")
+        row_period_s = _row_period_s(episode)
         if period_s is None:
-            period_s = episode.period_s * max(int(MAX_PERIOD_S / episode.period_s + 1e-6), 1)
-        every = max(round(period_s / episode.period_s), 1)
+            period_s = row_period_s * max(int(MAX_PERIOD_S / row_period_s + 1e-6), 1)
+        every = max(round(period_s / row_period_s), 1)
         for rows in unbroken_rows(episode):
             segment = _segment(index, episode, rows, period_s / every, every)
             if segment is not None:
@@ -199,17 +206,34 @@ def unbroken_rows(episode: EpisodeData) -> Iterable[slice]:
             yield slice(int(first), int(last))
 
 
+def _row_period_s(episode: EpisodeData) -> float:
+    """Mean time between rows without gaps where their stamps are even up to jitter and rounding, else the median."""
+    steps_s = np.diff(episode.times_s)
+    steps_s = steps_s[np.abs(steps_s - episode.period_s) < 0.5 * episode.period_s]
+    mean_s = float(np.mean(steps_s))
+    jitter_s = np.quantile(np.abs(steps_s - mean_s), 0.99)
+    return mean_s if jitter_s <= max(MAX_JITTER_SHARE * mean_s, MAX_JITTER_S) else episode.period_s
+
+
+def _even_grid(t_s: FloatArray, period_s: float) -> FloatArray:
+    """Even stamps from the first of ``t_s`` (N,) on, to the last if their period is nearly ``period_s``."""
+    duration_s = float(t_s[-1] - t_s[0])
+    steps = round(duration_s / period_s)
+    if abs(duration_s - steps * period_s) <= MAX_PERIOD_DEVIATION * duration_s:
+        return np.linspace(t_s[0], t_s[-1], steps + 1)
+    return np.asarray(t_s[0] + period_s * np.arange(int(duration_s / period_s + 1e-6) + 1))
+
+
 def _segment(index: int, episode: EpisodeData, rows: slice, period_s: float, every: int) -> RecordingSegment | None:
     t = episode.times_s[rows]
     states = episode.states[rows].copy()
     states[:, 2] = np.unwrap(states[:, 2])
     commands = np.vstack([episode.sent, episode.sent[-1:]])[rows]
-    count = int(np.floor((t[-1] - t[0]) / period_s + 1e-6)) + 1
-    grid = t[0] + period_s * np.arange(count)
+    grid = _even_grid(t, period_s)
     width = smoothing_width(period_s)
-    if count < max(width, MIN_QUINTIC_WIDTH) + 2:
+    if len(grid) < max(width, MIN_QUINTIC_WIDTH) + 2:
         return None
-    if np.abs(np.diff(t) - period_s).max() > 0.02 * period_s or count != len(t):
+    if len(grid) != len(t) or np.abs(t - grid).max() > MAX_OFFSET_SHARE * period_s:
         states = np.stack([np.interp(grid, t, column) for column in states.T], axis=1)
         commands = _cell_means(t, commands, grid, period_s)
     smooth = _smoothed(states, width, 3, period_s)
