@@ -1,25 +1,23 @@
 """An exclusive lock on one motor controller of a bus, so that two programs cannot command it.
 
 A CAN bus accepts any number of senders. Two programs that send to one motor controller alternate between the commands
-of both, and neither can see it. The lock is a file in the folder for temporary files, locked by ``flock``: it also
-excludes programs of other users with the same folder, and the kernel releases it when its process ends for any reason.
+of both, and neither can see it. The lock is a Unix socket with an abstract name (unix(7)): it excludes programs of all
+users of the computer, needs no file, and the kernel releases it when its process ends for any reason.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
+import errno
 import hashlib
 import os
-import stat
-import tempfile
+import socket
+import struct
 from pathlib import Path
 
 from carlab.core.errors import NotReadyError
 
-MAX_ATTEMPTS = 100
-"""Number of attempts to lock a file that its holder removes at the same time."""
-MAX_HOLDER_BYTES = 100
+MAX_QUESTIONS = 4096
+"""Number of programs that can ask for the holder; further ones do not learn its process."""
 
 
 class BusLock:
@@ -34,72 +32,41 @@ class BusLock:
         bus = os.path.realpath(channel) if channel.startswith("/") else channel
         process = os.getpid() if interface == "virtual" else 0
         key = hashlib.sha256(f"{interface}\0{bus}\0{controller_id}\0{process}".encode()).hexdigest()[:24]
-        self.path = Path(tempfile.gettempdir()) / f"carlab-bus-{key}.lock"
-        self._descriptor: int | None = None
+        self._address = f"\0carlab-bus-{key}"
+        self._socket: socket.socket | None = None
 
     def acquire(self) -> None:
         """Take the lock; idempotent. Raises NotReadyError if another program has it, without waiting."""
-        if self._descriptor is not None:
+        if self._socket is not None:
             return
-        for _ in range(MAX_ATTEMPTS):
-            descriptor = self._open()
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                holder = os.pread(descriptor, MAX_HOLDER_BYTES, 0).decode("ascii", "replace")
-                os.close(descriptor)
-                raise NotReadyError(
-                    f"{self.what} is in use",
-                    (f"another program drives it ({holder or 'its process is unknown'}); end that program first.",),
-                ) from error
-            if self._is_current(descriptor):
-                self._descriptor = descriptor
-                with contextlib.suppress(OSError):  # the file system is full: the holder has no name in messages
-                    os.ftruncate(descriptor, 0)
-                    os.pwrite(descriptor, f"process {os.getpid()}, started by process {os.getppid()}".encode(), 0)
-                return
-            os.close(descriptor)
-        raise NotReadyError(f"{self.what} is in use", ("other programs open and close it all the time; end them.",))
+        own = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            own.bind(self._address)
+            own.listen(MAX_QUESTIONS)
+        except OSError as error:
+            own.close()
+            if error.errno == errno.EADDRINUSE:
+                remedy = f"another program drives it ({self._holder()}); end that program first."
+                raise NotReadyError(f"{self.what} is in use", (remedy,)) from error
+            remedy = f"the system does not allow its lock, a Unix socket ({error.strerror}); allow it."
+            raise NotReadyError(f"{self.what} cannot be locked", (remedy,)) from error
+        self._socket = own
 
     def release(self) -> None:
-        """Release the lock and remove its file. Idempotent."""
-        descriptor, self._descriptor = self._descriptor, None
-        if descriptor is None:
-            return
-        if self._is_current(descriptor):
-            with contextlib.suppress(OSError):  # the file of another user
-                self.path.unlink()
-        os.close(descriptor)
+        """Release the lock. Idempotent."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
-    def _open(self) -> int:
-        """Open the file, or create it for all users. Raises NotReadyError if that is impossible."""
-        flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        try:
+    def _holder(self) -> str:
+        """Process that holds the lock, and its parent, for messages."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+            asking.setblocking(False)
             try:
-                descriptor = os.open(self.path, flags | os.O_CREAT | os.O_EXCL, 0o666)
-                os.fchmod(descriptor, 0o666)
-            except FileExistsError:
-                descriptor = os.open(self.path, flags)
-        except FileNotFoundError:
-            if self.path.parent.is_dir():  # its holder has removed it in between
-                return self._open()
-            raise self._impossible("the folder does not exist") from None
-        except OSError as error:
-            raise self._impossible(str(error.strerror)) from error
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            os.close(descriptor)
-            raise self._impossible("it is no regular file")
-        return descriptor
-
-    def _is_current(self, descriptor: int) -> bool:
-        """Whether the locked file still has its name; its former holder may have removed it."""
-        try:
-            return os.path.samestat(os.fstat(descriptor), self.path.stat())
-        except FileNotFoundError:
-            return False
-
-    def _impossible(self, reason: str) -> NotReadyError:
-        return NotReadyError(
-            f"{self.what} cannot be locked",
-            (f"the lock file {self.path} cannot be opened ({reason}); make the file or its folder writable.",),
-        )
+                asking.connect(self._address)
+                credentials = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+                process = struct.unpack("3i", credentials)[0]
+                parent = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1]
+            except OSError:
+                return "its process is unknown"
+        return f"process {process}, started by process {parent}"
