@@ -36,7 +36,7 @@ MAX_PERIOD_S = 0.034
 """Maximum period of a thinned recording [s]."""
 MIN_SPEED_MPS = 0.15
 """Windows in which the car is slower [m/s] are omitted, because any model predicts a parked car."""
-MAX_JITTER_SHARE, MAX_JITTER_S = 0.1, 1e-3
+MAX_JITTER_SHARE, MAX_JITTER_S = 0.2, 1e-3
 """Maximum deviation of the time between rows from its mean, share or [s]: jitter, or stamps in whole milliseconds."""
 MAX_PERIOD_DEVIATION = 1e-3
 """Maximum relative deviation of a segment's period from that of its grid."""
