@@ -2,11 +2,13 @@
 
 import importlib.util
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from carlab.core.angles import wrap
 from carlab.recording.audit.audit import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
@@ -98,6 +100,8 @@ def test_rows_off_the_path_are_single_rows_or_left_to_the_jumps(rate_hz, count):
         (lambda c: {"x": c["y"], "y": c["x"]}, ("wrong_frame", "yaw"), {"swap_xy": True}),
         (lambda c: {"vx": 0 * c["vx"], "vy": 0 * c["vy"]}, ("column_scale", "vx, vy"), {"velocities": "pose"}),
         (lambda c: {"yaw": c["yaw"] - 0.8}, ("wrong_frame", "yaw"), {"yaw_offset_rad": 0.8}),
+        (lambda c: {"yaw": c["yaw"] - 2.5}, ("wrong_frame", "yaw"), {"yaw_offset_rad": 2.5}),
+        (lambda c: {"yaw": c["yaw"] + np.pi}, ("wrong_frame", "yaw"), {"yaw_offset_rad": np.pi}),
     ],
     ids=[
         "steering sign",
@@ -111,6 +115,8 @@ def test_rows_off_the_path_are_single_rows_or_left_to_the_jumps(rate_hz, count):
         "swapped axes",
         "zero speed",
         "yaw offset",
+        "yaw of another axis",
+        "yaw to the rear",
     ],
 )
 def test_fault_is_found_and_repaired_by_its_option(clean, fault, finding, options, tmp_path):
@@ -123,6 +129,25 @@ def test_fault_is_found_and_repaired_by_its_option(clean, fault, finding, option
     truth = foreign.drive(UNEVEN)
     np.testing.assert_allclose(repaired.episode.states[:, 3], truth["vx"], atol=0.1)
     np.testing.assert_allclose(repaired.episode.states[:, 5], truth["yaw_rate"], atol=0.2)
+
+
+@pytest.mark.parametrize("offset_rad", [0.8, 1.57, 2.5, 3.14159, -1.2, -2.9])
+@pytest.mark.parametrize("declared_rad", [0.0, 0.4])
+def test_option_for_another_axis_of_yaw_is_its_angle_and_no_other_column_is_accused(
+    clean, offset_rad, declared_rad, tmp_path
+):
+    columns = {**clean, "yaw": clean["yaw"] - offset_rad}
+    report = import_drive(tmp_path, columns, yaw_offset_rad=declared_rad).report
+    assert list(warnings_of(report)) == [("wrong_frame", "yaw")]
+    option, value = warnings_of(report)["wrong_frame", "yaw"].option.split()
+    assert option == "--yaw-offset"
+    assert abs(wrap(float(value) - offset_rad)) < math.radians(10.0)
+
+
+def test_clockwise_yaw_accuses_no_other_column(clean, tmp_path):
+    report = import_drive(tmp_path, {**clean, "yaw": -clean["yaw"]}).report
+    assert list(warnings_of(report)) == [("wrong_sign", "yaw")]
+    assert report.of("unchecked")
 
 
 def test_suspected_fault_is_reported_but_not_repaired(clean, tmp_path):

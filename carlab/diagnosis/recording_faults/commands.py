@@ -20,6 +20,8 @@ from carlab.recording.faults.commands import (
     GridMotion,
     command_response,
     grid_motion,
+    moves_backward,
+    reversed_yaw,
     wrong_command_sign,
 )
 from carlab.recording.faults.fault import Fault
@@ -35,6 +37,24 @@ MIN_VARIANCE_RATIO = 1.15
 SAME_SHIFT_S = 0.06
 """[s] Maximum difference between a recording's shift and the median shift of the recordings to count as equal."""
 MIN_DRIFT_SIGMAS, MIN_DRIFT_S, MIN_DRIFT_RATE = 6.0, 0.04, 3e-4
+
+
+def check_yaw_direction(repairs: Sequence[EpisodeRepair]) -> None:
+    """Rotate yaw by 180 degrees if it points to the rear by both commands in all recordings with clear responses."""
+    motions = [repair.motion() for repair in repairs]
+    if not all(moves_backward(motion) for motion in motions):
+        return
+    clear = []
+    for repair, motion in zip(repairs, motions, strict=True):
+        responses = _responses(repair, grid_motion(repair.times_s, motion, repair.segment))
+        if all(r is not None and r.best > LIMITS.command_explained[k] for k, r in enumerate(responses)):
+            clear.append(reversed_yaw(responses))
+    fault = clear[0] if clear else None
+    if fault is None or None in clear:
+        return
+    for repair in repairs:
+        repair.states[:, 2] += np.pi
+        repair.repaired(fault, "yaw was rotated by 180 degrees")
 
 
 def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.findings import DataFault
-from carlab.diagnosis.recording_faults.commands import check_commands
+from carlab.diagnosis.recording_faults.commands import check_commands, check_yaw_direction
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair, merged
 from carlab.diagnosis.recording_faults.integration_step import check_integration
 from carlab.diagnosis.recording_faults.pose import check_pose
@@ -42,6 +42,7 @@ def check(
     usable = [repair for repair in repairs if repair.usable]
     for repair in usable:
         check_pose(repair, nominal.control_period_s)
+    check_yaw_direction([repair for repair in usable if repair.usable])
     check_velocities(usable, alike=alike)
     check_commands([repair for repair in usable if repair.usable], nominal)
     repaired = [repair.result() for repair in repairs]

@@ -20,6 +20,7 @@ CONTROL_PERIODS_S = (5e-4, 0.6)
 """[s] Range of plausible control and sampling periods of a model car."""
 MAX_INTERPOLATION_S = 0.25
 """[s] Maximum interpolated gap: motion of 2 Hz at 10 m/s^2 deviates by 2 mm from a cubic."""
+MAX_HEADING_REPAIRS = 3
 MIN_OFFSET_RAD = math.radians(30.0)
 """[rad] A smaller constant offset of yaw is a parameter of the measurement."""
 
@@ -53,7 +54,15 @@ def _check_time_unit(repair: EpisodeRepair, control_period_s: float) -> None:
 
 
 def _check_frame(repair: EpisodeRepair) -> None:
-    """Repair unit, sign and axes of the pose by the course over ground."""
+    """Repair unit, sign and axes of the pose by the course over ground; an axis shows after unit and sign are right."""
+    for _ in range(MAX_HEADING_REPAIRS):
+        n_faults = len(repair.faults)
+        _repair_heading(repair)
+        if len(repair.faults) == n_faults:
+            return
+
+
+def _repair_heading(repair: EpisodeRepair) -> None:
     states = repair.states
     for fault in heading_faults(repair.times_s, {"x": states[:, 0], "y": states[:, 1], "yaw": states[:, 2]}):
         option = fault.option or ""

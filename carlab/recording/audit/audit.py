@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit import file_checks
 from carlab.recording.audit.report import AuditReport, Finding, Severity
@@ -19,6 +20,8 @@ from carlab.recording.faults.commands import (
     CommandResponse,
     command_response,
     grid_motion,
+    moves_backward,
+    reversed_yaw,
     wrong_command_sign,
 )
 from carlab.recording.faults.fault import Fault
@@ -69,8 +72,20 @@ class Channels:
         return periods_by_distance(position, velocity, self.segment)
 
 
-def audit_channels(channels: Channels, mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
-    """Check all but order, gaps and jumps. Returns findings and the mask of rows with a yaw_rate spike, (N,)."""
+def audit_channels(
+    channels: Channels, mapping: ColumnMapping, heading: Sequence[Finding] = ()
+) -> tuple[list[Finding], BoolArray]:
+    """Check all but order, gaps, jumps and heading.
+
+    Args:
+        channels: the recording.
+        mapping: meaning of the columns.
+        heading: findings of ``check_heading``. A wrong yaw makes right velocities and commands look wrong, so these
+            are not checked then.
+
+    Returns:
+        Findings and the mask of rows with a yaw_rate spike, (N,).
+    """
     t_s, values, motion = channels.t_s, channels.values, channels.motion
     findings = file_checks.check_held(t_s, {**values, **channels.extra})
     findings += file_checks.check_command_range(values, mapping)
@@ -80,8 +95,19 @@ def audit_channels(channels: Channels, mapping: ColumnMapping) -> tuple[list[Fin
     if motion is None:
         return findings, np.zeros(len(t_s), dtype=bool)
     findings += file_checks.check_stale(t_s, values)
+    responses = _command_responses(channels, motion, mapping)
+    has_wrong_yaw = any(finding.severity is Severity.FAULT for finding in heading)
+    if not has_wrong_yaw and moves_backward(motion) and (fault := reversed_yaw(list(responses.values()))):
+        findings.append(_finding(fault, mapping))
+        has_wrong_yaw = True
+    if has_wrong_yaw:
+        sentence = "Velocities and commands are not compared with the motion of the pose until yaw is corrected."
+        findings.append(
+            Finding("unchecked", ", ".join((*VELOCITY_CHANNELS, *COMMAND_CHANNELS)), Severity.INFO, sentence)
+        )
+        return findings, np.zeros(len(t_s), dtype=bool)
     found, spikes = _check_velocities(channels, motion, mapping)
-    findings += found + _check_commands(channels, motion, mapping)
+    findings += found + _check_commands(channels, motion, responses, mapping)
     states = velocity_references(motion)
     for name, channel in mapping.references.items():
         if name not in channels.extra:
@@ -104,6 +130,9 @@ def _finding(fault: Fault, mapping: ColumnMapping) -> Finding:
     """A fault of columns, by their names. A unit that is not SI and not declared is an error."""
     if fault.id == "too_little_motion":
         return Finding.of_fault(fault, Severity.INFO)
+    if "offset_rad" in fault.evidence:  # the option replaces the offset of the mapping
+        offset_rad = wrap(mapping.yaw_offset_rad + fault.evidence["offset_rad"])
+        fault = replace(fault, option=f"--yaw-offset {offset_rad:.3f}")
     sources = [mapping.columns[channel] for channel in fault.channel.split(", ")]
     severity, remedy = Severity.FAULT, f"use {fault.option}"
     if fault.id == "wrong_unit" and not sources[0].unit:
@@ -222,19 +251,40 @@ def _lag_findings(channel: str, t_s: FloatArray, fit: ColumnFit) -> list[Finding
     return [] if fault is None else [Finding.of_fault(fault, Severity.INFO, remedy)]
 
 
-def _check_commands(channels: Channels, motion: PoseMotion, mapping: ColumnMapping) -> list[Finding]:
+def _sent_command(channels: Channels, channel: str, mapping: ColumnMapping) -> FloatArray:
+    """The command (N,) that reached the car."""
+    command = np.nan_to_num(channels.values[channel])
+    if channel == "throttle" and mapping.throttle_gate:
+        command = command * channels.extra[mapping.throttle_gate]
+    return command
+
+
+def _command_responses(
+    channels: Channels, motion: PoseMotion, mapping: ColumnMapping
+) -> dict[str, CommandResponse | None]:
+    """Response of the motion to each command."""
+    grid = grid_motion(channels.t_s, motion, channels.segment)
+    return {
+        channel: command_response(grid, channels.t_s, _sent_command(channels, channel, mapping), channel)
+        for channel in COMMAND_CHANNELS
+    }
+
+
+def _check_commands(
+    channels: Channels,
+    motion: PoseMotion,
+    responses: Mapping[str, CommandResponse | None],
+    mapping: ColumnMapping,
+) -> list[Finding]:
     """Sign and delay of both commands by their effect on the motion."""
     findings = []
-    grid = grid_motion(channels.t_s, motion, channels.segment)
-    for index, channel in enumerate(COMMAND_CHANNELS):
-        command = np.nan_to_num(channels.values[channel])
-        if channel == "throttle" and mapping.throttle_gate:
-            command = command * channels.extra[mapping.throttle_gate]
-        response = command_response(grid, channels.t_s, command, channel)
+    is_long = grid_motion(channels.t_s, motion, channels.segment).rows.sum() >= MIN_ROWS
+    for index, (channel, response) in enumerate(responses.items()):
+        command = _sent_command(channels, channel, mapping)
         effect = EFFECTS[channel]
         evidence = {} if response is None else _command_evidence(channel, channels.t_s, command, motion, response)
         if response is None or response.best < LIMITS.command_explained[index]:
-            if np.ptp(command) > MIN_COMMAND_RANGE and grid.rows.sum() >= MIN_ROWS:
+            if np.ptp(command) > MIN_COMMAND_RANGE and is_long:
                 sentence = f"{channel.capitalize()} explains too little of {effect}: its sign is unknown."
                 findings.append(Finding("unclear_sign", channel, Severity.INFO, sentence, evidence=evidence))
         elif response.gain < 0 and response.lag_s > -LIMITS.early_response_s:

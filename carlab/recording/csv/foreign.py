@@ -86,13 +86,13 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     if mapping.clock == "even":
         t_s, new_findings = even_clock(t_s)
         findings += new_findings
-    if not mapping.dead_reckoning:
-        findings += check_heading(t_s, values, mapping)
+    heading = [] if mapping.dead_reckoning else check_heading(t_s, values, mapping)
+    findings += heading
     raise_errors(source, findings)
 
     channels, new_findings = _channels(t_s, values, extra, mapping)
     findings += new_findings
-    new_findings, spikes = audit_channels(channels, mapping)
+    new_findings, spikes = audit_channels(channels, mapping, heading)
     findings += new_findings
     raise_errors(source, findings)
     clock_notes: dict[str, str] = {}

@@ -7,7 +7,7 @@ motor and tyres add to the time constant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -208,6 +208,27 @@ def wrong_command_sign(channel: str, response: CommandResponse, evidence: Mappin
     effect = "turns right" if channel == "steering" else "is driven backward"
     observation = f"with positive {channel} the car {effect} (this explains {response.best:.0%} of the motion)"
     return Fault("wrong_sign", channel, observation, evidence or {}, f"--{channel}-sign -1")
+
+
+def moves_backward(motion: PoseMotion) -> bool:
+    """Whether the car moves backward by its yaw in most of the rows in which it moves."""
+    moving = np.abs(motion.vx) > MIN_MPS
+    return bool(moving.any() and np.mean(motion.vx[moving] < 0.0) > 0.5)
+
+
+def reversed_yaw(responses: Sequence[CommandResponse | None]) -> Fault | None:
+    """The fault of a yaw that points to the rear; ``responses`` to steering and throttle, of a car that moves backward.
+
+    Both commands then act the wrong way round. A car that really drives backward follows both with the right sign.
+    """
+    for response, min_share in zip(responses, LIMITS.command_explained, strict=True):
+        if response is None or response.best < min_share or response.gain > 0:
+            return None
+    observation = (
+        "by its yaw the car mostly moves backward, and both steering and throttle act the wrong way round: yaw points "
+        "to the rear"
+    )
+    return Fault("wrong_frame", "yaw", observation, {"offset_rad": np.pi}, f"--yaw-offset {np.pi:.4f}")
 
 
 def _slope_average(values: FloatArray, width: int) -> FloatArray:

@@ -99,9 +99,12 @@ def _clockwise(mean: complex, declared: float, evidence: Mapping[str, float]) ->
 def _offset(path: _Course, mean: float) -> float:
     """Angle from yaw to course [rad] without what turning adds: a point ahead of the rear axle moves sideways.
 
-    Fits course - yaw = offset + ahead * (signed path curvature) by the rows less than 45 degrees from ``mean``.
+    Fits course - yaw = offset + ahead * (signed path curvature) by the rows less than 45 degrees from ``mean``. Of two
+    opposite angles, the one counts by which the car mostly moves forward.
     """
     away = wrap(path.course - path.yaw - mean)
+    if abs(mean) > LIMITS.heading_offset_rad and np.mean(np.abs(away) < np.pi / 2) < 0.5:
+        mean, away = float(wrap(mean + np.pi)), wrap(away + np.pi)
     forward = np.where(np.abs(away) < np.pi / 2, 1.0, -1.0)
     away = (away + np.pi / 2) % np.pi - np.pi / 2
     near = np.abs(away) < np.pi / 4

@@ -1,0 +1,57 @@
+"""A constant angle between car and tracked rigid body is repaired, also if the body points backward."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from carlab.core.episode_data import EpisodeData
+from carlab.diagnosis.recording_faults.find import check
+from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.recorded_drives import PERIOD_S, drive, driven
+
+NOMINAL = SimulatorConfig(control_period_s=PERIOD_S)
+YAW, YAW_RATE = 2, 5
+
+
+@pytest.fixture(scope="module")
+def clean() -> EpisodeData:
+    return drive(NOMINAL, 45.0, 1)
+
+
+def yaw_error(found: EpisodeData, true: EpisodeData) -> np.ndarray:
+    return np.abs((found.states[:, YAW] - true.states[:, YAW] + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+@pytest.mark.parametrize("source", ["column", "pose"])
+@pytest.mark.parametrize("offset_deg", [60.0, -90.0, 120.0, -150.0, 180.0])
+def test_yaw_of_another_axis_is_the_only_repaired_column(clean: EpisodeData, offset_deg: float, source: str) -> None:
+    states = clean.states.copy()
+    states[:, YAW] += np.deg2rad(offset_deg)
+    rotated = replace(clean, states=states, metadata={"velocity_source": source})
+    (found,), _, faults = check([rotated], [], NOMINAL)
+    assert [(f.id, f.channel) for f in faults] == [("wrong_frame", "yaw")]
+    assert yaw_error(found, clean).max() < np.deg2rad(2.0)
+    np.testing.assert_array_equal(found.sent, clean.sent)
+    np.testing.assert_allclose(found.states[:, 3], clean.states[:, 3], atol=0.1)
+
+
+def test_an_axis_is_found_after_the_sense_of_rotation(clean: EpisodeData) -> None:
+    states = clean.states.copy()
+    states[:, YAW] = -(states[:, YAW] + np.deg2rad(40.0))
+    (found,), _, faults = check([replace(clean, states=states)], [], NOMINAL)
+    assert [(f.id, f.channel) for f in faults] == [("wrong_sign", "yaw"), ("wrong_frame", "yaw")]
+    assert yaw_error(found, clean).max() < np.deg2rad(2.0)
+
+
+def test_a_drive_in_reverse_gear_is_unchanged() -> None:
+    rng = np.random.default_rng(2)
+    levels = np.column_stack([rng.uniform(-0.8, 0.8, 90), rng.choice([-0.8, -0.5, -0.3, -0.1, 0.0], 90)])
+    commands = np.repeat(levels, 15, axis=0)
+    states = driven(NOMINAL, commands)
+    times_s = PERIOD_S * np.arange(len(states))
+    backward = EpisodeData(times_s, states, commands, commands, np.zeros(len(commands)))
+    assert np.mean(states[:, 3] < 0.0) > 0.8
+    (found,), _, faults = check([backward], [], NOMINAL)
+    assert found is backward
+    assert faults == []
