@@ -338,7 +338,7 @@ def cut_windows(
         raise DataError("The recordings have no stretch without a gap that is long enough; record a longer drive.")
     period_s = segments[0].period_s
     steps = max(round(horizon_s / period_s), 1)
-    stride = max(round(stride_s / period_s), 1)
+    stride = max(round(stride_s / period_s + 1e-3), 1)  # 0.25 s are eight rows at 30 Hz, also with jitter
     starts = [
         (segment, row)
         for segment in segments

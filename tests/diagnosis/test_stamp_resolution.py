@@ -57,3 +57,11 @@ def test_rows_with_stamps_in_whole_milliseconds_at_30_hz_are_not_interpolated() 
     (segment,) = segments_of([episode])
     np.testing.assert_array_equal(segment.states, episode.states)
     np.testing.assert_array_equal(segment.commands[:-1], episode.sent)
+
+
+@pytest.mark.parametrize("seconds", [99.9, 100.0, 100.1])
+def test_jitter_does_not_change_the_distance_of_windows(seconds: float) -> None:
+    """A stride of 0.25 s is 7.5 rows at 30 Hz."""
+    episode = recorded(30.0, 0.0, jitter_s=1e-5, seconds=seconds)
+    windows = cut_windows(segments_of([episode]), 0.8, 0.25)
+    assert set(np.round(np.diff(windows.t0_s) * 30.0).astype(int)) == {8}
