@@ -22,6 +22,8 @@ REPORTED_FAULTS = (
     *("wrong_unit", "wrong_sign", "wrong_frame", "integration_error"),
 )
 """Findings of the CSV audit that the report lists as data faults if they were repaired."""
+LEFT_OUT_ROWS = ("not_a_number", "stamp_order")
+"""Findings of the CSV audit about rows that were left out; the report lists them too."""
 
 
 @dataclass(slots=True)
@@ -176,9 +178,9 @@ def _read_csv(path: Path, mapping: Any, loaded: LoadedRecordings) -> None:
     loaded.episodes += list(read.imported.episodes)
     loaded.notes.append(read.imported.announcement)
     repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
+    left_out = [f for f in repaired if f.id in LEFT_OUT_ROWS]
     rows = read.imported.episodes[-1].ticks + 1
     loaded.faults += [
         DataFault(f.id, f.channel, f.count or rows, f"repaired: {f.sentence}")
-        for f in (*read.repaired, *repaired)
-        if f.id in REPORTED_FAULTS
+        for f in (*(f for f in (*read.repaired, *repaired) if f.id in REPORTED_FAULTS), *left_out)
     ]

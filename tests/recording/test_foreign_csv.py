@@ -344,7 +344,9 @@ class TestRefusal:
         ("content", "message"),
         [
             (b"", "is empty"),
-            (b"t,x,y,yaw,steering,throttle\n", "has 0 rows"),
+            (b"t,x,y,yaw,steering,throttle\n", r"has too few rows \(0\); a recording needs at least three"),
+            (b"t,x,y,yaw,steering,throttle\n" + 2 * b"0,0,0,0,0,0\n", r"has too few rows \(2\); a recording needs"),
+            (b"t,x,y,yaw,steering,throttle\n" + 3 * b"2024-01-22 11:59:45,0,0,0,0,0\n", "write the column as numbers"),
             (b"0,1,2,3,4,5\n1,1,1,1,1,1\n2,2,2,2,2,2\n", "header line"),
             (b"t,x,y,yaw,steering,throttle\n0,0,0,0,0,0\n1,1,1\n2,2,2,2,2,2\n", "Row 2"),
             (b"t,t,y,yaw,steering,throttle\n0,0,0,0,0,0\n1,1,1,1,1,1\n", "two columns named 't'"),

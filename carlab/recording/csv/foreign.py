@@ -150,7 +150,7 @@ def _usable_rows(
     raise_errors(source, findings)
     usable_rows = np.flatnonzero(is_complete)[is_increasing]
     if len(usable_rows) < 3:
-        raise DataError(f"{source} has {len(usable_rows)} usable rows; a recording needs at least three.")
+        raise DataError(f"{source} has too few usable rows ({len(usable_rows)}); a recording needs at least three.")
     usable_values, usable_extra = (
         {name: column[usable_rows] for name, column in columns.items()} for columns in (values, extra)
     )

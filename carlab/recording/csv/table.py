@@ -42,11 +42,9 @@ class CsvTable:
         if name in self.texts:
             row, cell = self.texts[name]
             is_ambiguous = "," in cell and _is_number(cell.replace(".", "").replace(",", ""))
-            remedy = (
-                "write all numbers with a decimal point and without separators of thousands"
-                if is_ambiguous
-                else "correct or empty that cell"
-            )
+            remedy = "write the column as numbers (a date as seconds)" if row == 1 else "correct or empty that cell"
+            if is_ambiguous:
+                remedy = "write all numbers with a decimal point and without separators of thousands"
             raise DataError(
                 f"Row {row} of column '{name}' in {self.path.name} holds {cell!r}, which is not a number; {remedy}."
             )
@@ -70,7 +68,7 @@ def read_csv(path: Path | str) -> CsvTable:
     except csv.Error as error:
         raise DataError(f"{path.name} is not a CSV file ({error}); export it as CSV with one header line.") from error
     if not lines:
-        raise DataError(f"{path.name} is empty; a recording has a header and at least two rows.")
+        raise DataError(f"{path.name} is empty; a recording has a header and at least three rows.")
     header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
     if all(_is_number(cell) or has_decimal_comma(cell) for cell in header):
         raise DataError(f"{path.name} begins with numbers; add a header line with the column names.")
@@ -91,8 +89,8 @@ def read_csv(path: Path | str) -> CsvTable:
                 f"Row {number} of {path.name} has {len(row)} cells where the header has {len(header)}; {cause}"
                 "correct or remove that row."
             )
-    if len(lines) < 3:
-        raise DataError(f"{path.name} has {len(lines) - 1} rows; a recording needs at least two.")
+    if len(lines) < 4:
+        raise DataError(f"{path.name} has too few rows ({len(lines) - 1}); a recording needs at least three.")
     cells = {
         name: ["nan" if row[index].strip().lower() in _MISSING else row[index] for row in lines[1:]]
         for index, name in enumerate(header)
