@@ -7,6 +7,7 @@ import pytest
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.recording_faults.find import check
+from carlab.recording.faults.heading import heading_faults
 from sim_backends.car_parameters import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive, driven
 
@@ -55,3 +56,12 @@ def test_a_drive_in_reverse_gear_is_unchanged() -> None:
     (found,), _, faults = check([backward], [], NOMINAL)
     assert found is backward
     assert faults == []
+
+
+def test_slip_in_reverse_gear_is_no_yaw_that_points_to_the_rear() -> None:
+    t_s = np.arange(0.0, 20.0, PERIOD_S)
+    yaw = 0.9 * t_s
+    course = yaw + np.pi + np.deg2rad(20.0)
+    x, y = (np.cumsum(PERIOD_S * component) for component in (np.cos(course), np.sin(course)))
+    (fault,) = heading_faults(t_s, {"x": x, "y": y, "yaw": yaw})
+    assert fault.evidence["offset_rad"] == pytest.approx(np.deg2rad(20.0), abs=0.03)

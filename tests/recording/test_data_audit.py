@@ -133,15 +133,20 @@ def test_fault_is_found_and_repaired_by_its_option(clean, fault, finding, option
 
 @pytest.mark.parametrize("offset_rad", [0.8, 1.57, 2.5, 3.14159, -1.2, -2.9])
 @pytest.mark.parametrize("declared_rad", [0.0, 0.4])
-def test_option_for_another_axis_of_yaw_is_its_angle_and_no_other_column_is_accused(
+def test_options_for_another_axis_of_yaw_lead_to_its_angle_and_accuse_no_other_column(
     clean, offset_rad, declared_rad, tmp_path
 ):
+    """Within 30 degrees of the rear, the car seems to slip in reverse gear; the second import shows the rear."""
     columns = {**clean, "yaw": clean["yaw"] - offset_rad}
-    report = import_drive(tmp_path, columns, yaw_offset_rad=declared_rad).report
-    assert list(warnings_of(report)) == [("wrong_frame", "yaw")]
-    option, value = warnings_of(report)["wrong_frame", "yaw"].option.split()
-    assert option == "--yaw-offset"
-    assert abs(wrap(float(value) - offset_rad)) < math.radians(10.0)
+    found_rad = declared_rad
+    for _ in range(2):
+        warnings = warnings_of(import_drive(tmp_path, columns, yaw_offset_rad=found_rad).report)
+        if warnings:
+            assert list(warnings) == [("wrong_frame", "yaw")]
+            option, value = warnings["wrong_frame", "yaw"].option.split()
+            assert option == "--yaw-offset"
+            found_rad = float(value)
+    assert abs(wrap(found_rad - offset_rad)) < math.radians(10.0)
 
 
 def test_clockwise_yaw_accuses_no_other_column(clean, tmp_path):

@@ -100,16 +100,16 @@ def _offset(path: _Course, mean: float) -> float:
     """Angle from yaw to course [rad] without what turning adds: a point ahead of the rear axle moves sideways.
 
     Fits course - yaw = offset + ahead * (signed path curvature) by the rows less than 45 degrees from ``mean``. Of two
-    opposite angles, the one counts by which the car mostly moves forward.
+    opposite angles that slip cannot explain, the one counts by which the car mostly moves forward.
     """
     away = wrap(path.course - path.yaw - mean)
-    if abs(mean) > LIMITS.heading_offset_rad and np.mean(np.abs(away) < np.pi / 2) < 0.5:
-        mean, away = float(wrap(mean + np.pi)), wrap(away + np.pi)
-    forward = np.where(np.abs(away) < np.pi / 2, 1.0, -1.0)
+    is_forward = np.abs(away) < np.pi / 2
     away = (away + np.pi / 2) % np.pi - np.pi / 2
     near = np.abs(away) < np.pi / 4
-    design = np.column_stack([np.ones(int(near.sum())), (forward * path.turn_per_m)[near]])
-    if float(np.std(design[:, 1])) < 1e-6:
-        return mean
-    fitted = mean + float(np.linalg.lstsq(design, away[near], rcond=None)[0][0])
-    return min(mean, fitted, key=abs)  # always turning alike, the fit extrapolates; turning tightly, the mean is biased
+    design = np.column_stack([np.ones(int(near.sum())), (np.where(is_forward, 1.0, -1.0) * path.turn_per_m)[near]])
+    offset = mean
+    if float(np.std(design[:, 1])) >= 1e-6:
+        fitted = mean + float(np.linalg.lstsq(design, away[near], rcond=None)[0][0])
+        offset = min(mean, fitted, key=abs)  # always turning alike, the fit extrapolates; tightly, the mean is biased
+    is_reversed = abs(offset) > LIMITS.slip_rad and np.mean(is_forward) < 0.5
+    return float(wrap(offset + np.pi)) if is_reversed else offset

@@ -45,6 +45,9 @@ class FaultSettings:
     """Gain of concentration at which another reading of yaw is accepted."""
     heading_offset_rad: float = math.radians(10.0)
     """[rad] A misplaced rigid body is off by less, another convention (yaw from north) by 90 degrees."""
+    slip_rad: float = math.radians(30.0)
+    """[rad] A larger angle between yaw and the mean course is not due to slip or tight turns; a smaller one in reverse
+    gear is no yaw that points to the rear."""
 
     scale_share: float = 0.06
     """A factor this far from 1 is a fault. A filter of another kind than first order leaves 2 to 3 %."""
