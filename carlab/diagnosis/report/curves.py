@@ -70,8 +70,12 @@ def _quantity(curve_id: str) -> str:
 
 
 def curves_advice(diagnosis: Diagnosis) -> str:
-    """Advice to measure curves if a complete diagnosis without them leaves a relevant residual; else empty."""
-    if diagnosis.curves or not diagnosis.search.covers_catalogue:
+    """Advice to measure curves if a diagnosis without them leaves a relevant residual; else empty.
+
+    Empty too if the user restricted or ended the search: the report then advises a search of the whole catalogue. A
+    search that ends at its time limit, as those of real cars often do, gets both.
+    """
+    if diagnosis.curves or diagnosis.search.effects or diagnosis.search.stopped_by == "user":
         return ""
     if diagnosis.verdict not in ("mismatch", "unexplained") or relevant_residual(diagnosis) is None:
         return ""
