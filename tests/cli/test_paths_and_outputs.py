@@ -319,7 +319,7 @@ def test_report_of_a_refused_import_is_written_with_the_reason(carlab: Carlab, t
 
 
 def test_report_of_a_file_that_is_no_recording_has_the_reason(carlab: Carlab, tmp_path: Path) -> None:
-    (tmp_path / "drive.csv").write_text("time,x,y\n0,0,0\n1,1,1\n", encoding="utf-8")
+    (tmp_path / "drive.csv").write_text("time,x,y\n0,0,0\n1,1,1\n2,2,2\n", encoding="utf-8")
     assert carlab("import", tmp_path / "drive.csv", "--report", tmp_path / "audit.json")[0] == 1
     content = json.loads((tmp_path / "audit.json").read_text())
     assert "drive.csv has no column t" in content["refusal"]

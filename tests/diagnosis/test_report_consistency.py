@@ -79,9 +79,7 @@ def test_refit_near_the_noise_leaves_no_missing_physics() -> None:
         (SearchExtent(False, "user"), "without a stop"),
     ],
 )
-def test_residual_of_a_partial_search_is_searched_before_it_is_driven(
-    search: SearchExtent, remedy: str
-) -> None:
+def test_residual_of_a_partial_search_is_searched_before_it_is_driven(search: SearchExtent, remedy: str) -> None:
     partial = replace(diagnosis("mismatch", 12.5, with_effects=9.7), search=search)
     assert next_drive(partial) == ("", f"Diagnose these recordings again {remedy}, before another drive.")
     assert bool(curves_advice(partial)) == (partial.search.stopped_by == "budget")

@@ -93,6 +93,8 @@ def drive(
     duration_s: float,
     *,
     start: tuple[float, ...] = (0.0,) * 6,
+    rtol: float = RTOL,
+    integrator: str = "dop853",
 ) -> Drive:
     """Drive the car with neutral commands before the start.
 
@@ -101,6 +103,8 @@ def drive(
         driver: Called at every tick with its time and the newest captured state; returns (steering, throttle).
         duration_s: Length; the last row is the last tick not after it.
         start: x, y, psi, vx, vy, r at time 0; before it the car moves at its initial velocity.
+        rtol: Relative tolerance of the integrator (absolute: a tenth of it).
+        integrator: Adaptive integrator of scipy, ``dop853`` or the faster ``dopri5``.
 
     Raises:
         DataError: the integration fails.
@@ -112,7 +116,7 @@ def drive(
     gap = period / per_row
     latency = car.latency + world.extra_latency_s
     acting = _Acting(world)
-    solver = ode(acting.rates).set_integrator("dop853", rtol=RTOL, atol=0.1 * RTOL, nsteps=4000)
+    solver = ode(acting.rates).set_integrator(integrator, rtol=rtol, atol=0.1 * rtol, nsteps=4000)
     t, state = 0.0, np.concatenate([np.asarray(start, dtype=np.float64), world.hidden(start[3])])
     capture_s = np.arange((count - 1) * per_row + 1, dtype=np.float64) * gap - latency
     captures = np.empty((len(capture_s), 6))
