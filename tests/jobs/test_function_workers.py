@@ -30,7 +30,9 @@ def test_results_are_in_the_order_of_the_arguments_with_and_without_children() -
             assert workers.map(operator.pow, []) == []
 
 
-def test_a_child_makes_a_part_of_the_calls() -> None:
+def test_a_child_makes_a_part_of_the_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The command line, which an earlier test may have called, sets it; a child imports this file from this folder.
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     with FunctionWorkers(2) as workers:
         made: set[int] = set()
         deadline_s = time.monotonic() + 60.0
