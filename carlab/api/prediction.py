@@ -49,7 +49,7 @@ class PredictionErrors:
 
     @property
     def events(self) -> EventUse:
-        """Events of the recordings (collisions, a hand), which are left out of the errors unless they were kept."""
+        """Events of the recordings (collisions, a hand), left out of the errors without ``keep_events``."""
         return self.score.events
 
     @property

@@ -135,16 +135,16 @@ class Task(ABC):
             ConfigError: the task does not let a run set them, for example because one is a property.
         """
         ticks = {} if max_ticks is None else {"max_ticks": max_ticks}
-        return self._changed({"history_length": history_length, **ticks})
+        return self._with_attributes({"history_length": history_length, **ticks})
 
     def _at_tick_weight(self, period_s: float) -> Self:
         """Copy whose ``tick_weight`` is the duration of a tick in reference ticks, with the same duration."""
         weight = round(period_s * REFERENCE_RATE_HZ, TICK_WEIGHT_DIGITS)
         if weight == 1.0:
             return self
-        return self._changed({"tick_weight": weight, "max_ticks": max(round(self.max_ticks / weight), 1)})
+        return self._with_attributes({"tick_weight": weight, "max_ticks": max(round(self.max_ticks / weight), 1)})
 
-    def _changed(self, values: Mapping[str, float]) -> Self:
+    def _with_attributes(self, values: Mapping[str, float]) -> Self:
         """Copy with other attributes. Raises ConfigError if one cannot be set."""
         changed = copy.copy(self)
         for name, value in values.items():

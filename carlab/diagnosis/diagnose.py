@@ -28,7 +28,7 @@ from carlab.diagnosis.final_models import (
     measured_curves,
     trained_models,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, most_complete
+from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, final_model_name
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -267,7 +267,7 @@ def _assemble_result(
         fitted_score=fitted_score(scored, recordings, request),
         skill=skill_of(
             held_out.windows,
-            final_errors[most_complete(final_errors)],
+            final_errors[final_model_name(final_errors)],
             final_errors["constant_velocity"],
             request.settings.evidence,
         ),

@@ -11,7 +11,7 @@ from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
 from carlab.diagnosis.curves.support import without_extrapolation
 from carlab.diagnosis.drift import Adaptation, adapt_to_held_out
 from carlab.diagnosis.evidence import ScoredSearch, Texts, unexplained_share
-from carlab.diagnosis.findings import Ceiling, CurveTrial, DataFault, FitErrors, RecordingUse, most_complete
+from carlab.diagnosis.findings import Ceiling, CurveTrial, DataFault, FitErrors, RecordingUse, final_model_name
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.recordings import SplitRecordings
@@ -114,7 +114,7 @@ def trained_models(
         models["with_curves"] = SimulatorModel(measured.fit.config)
 
     networks = (
-        ("with_discrepancy", "learned discrepancy", request.discrepancy, models[most_complete(models)]),
+        ("with_discrepancy", "learned discrepancy", request.discrepancy, models[final_model_name(models)]),
         ("black_box", "black box", request.ceiling, None),
     )
     for key, name, is_requested, simulator in networks:
@@ -156,7 +156,7 @@ def ceiling_by_networks(errors: Mapping[str, FitErrors]) -> Ceiling | None:
     networks = [errors[name].score for name in ("black_box", "with_discrepancy") if name in errors]
     if not networks:
         return None
-    return ceiling_of(errors["refit"].score, errors[most_complete(errors)].score, min(networks))
+    return ceiling_of(errors["refit"].score, errors[final_model_name(errors)].score, min(networks))
 
 
 __all__ = [

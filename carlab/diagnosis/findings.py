@@ -340,7 +340,7 @@ def _drift_table(drift: Drift) -> dict[str, Any]:
     return table | {name: getattr(drift, name).tolist() for name in ("t_s", "mean", "std")}
 
 
-def most_complete(models: Iterable[str]) -> str:
+def final_model_name(models: Iterable[str]) -> str:
     """Name of the model that model.toml contains, of the names of all models."""
     names = set(models)
     return next((n for n in ("with_curves", "with_uncatalogued_physics") if n in names), "with_effects")

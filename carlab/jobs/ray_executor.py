@@ -85,7 +85,7 @@ class RayExecutor:
         except ConnectionError as error:
             raise DataError(
                 f"The Ray cluster {self.address} does not answer any more ({first_line(error)}); finished cases are "
-                "kept, so run the same command again when it is back."
+                "stored, so run the same command again when it is back."
             ) from error
         return end
 

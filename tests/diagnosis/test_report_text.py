@@ -235,14 +235,6 @@ def test_curves_are_advised_for_a_relevant_residual(verdict: str, share: float, 
     assert curves_advice(stopped) == "", "a complete search comes first"
 
 
-@pytest.mark.parametrize(("verdict", "is_stated"), [("unexplained", True), ("none", False)])
-def test_integration_error_beyond_the_noise_is_stated_with_an_unexplained_error(verdict: str, is_stated: bool) -> None:
-    faults = tuple(DataFault("integration_error", channel, 64, "reported") for channel in ("y", "yaw"))
-    text = verdict_sentence(replace(diagnosis(verdict), data_faults=faults))
-    assert ("noise of the recordings in lateral position and heading" in text) == is_stated
-    assert "integration error" not in verdict_sentence(diagnosis("unexplained"))
-
-
 def test_next_drive_separates_the_strongest_set() -> None:
     drive, why = next_drive(diagnosis("mismatch", finding("yaw_damping"), finding("motor_lag", ("throttle_delay",))))
     assert drive == "throttle_steps"

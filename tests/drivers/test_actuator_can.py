@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,11 +29,11 @@ from drivers.links.link import CanFrame
 from drivers.sender.logic import SenderState
 from drivers.sender.process import SenderThread
 from drivers.vesc.can_device import VescCanDevice
+from tests.helpers.waiting import TIMEOUT_S, until
 
 ROOT = Path(__file__).resolve().parents[2]
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)
-TIMEOUT_S = 20.0
 CHILD = """
 import sys, time
 from carlab.core.quantities import Action
@@ -62,13 +61,6 @@ def config_for(interface: str, channel: str, **changes: Any) -> ActuatorConfig:
         telemetry_lost_s=10.0,
     )
     return replace(config, **changes)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end_s, "the condition was not met in time"
-        time.sleep(0.002)
 
 
 def channel_name() -> str:

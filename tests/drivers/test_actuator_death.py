@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,9 +19,9 @@ from drivers.emulators.command_log import CommandLog, LogEntry
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.sender.process import SenderProcess
+from tests.helpers.waiting import TIMEOUT_S, until
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMEOUT_S = 20.0
 MOTOR_TIMEOUT_S = 0.4
 
 CHILD = """
@@ -136,19 +135,12 @@ class Drive:
         assert self.process.stdout is not None
         self.lines = self.process.stdout
         self.sender_pid = int(self.lines.readline().split()[1]) if failure != "no_close" else 0
-        wait_for(lambda: any(e.value == 3.0 for e in self.log.motor()))
+        until(lambda: any(e.value == 3.0 for e in self.log.motor()))
 
     def end(self) -> str:
         """Wait for the child to end and return its remaining output."""
         output, _ = self.process.communicate(timeout=TIMEOUT_S)
         return str(output)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end_s, "the condition was not met in time"
-        time.sleep(0.005)
 
 
 @pytest.fixture
@@ -182,7 +174,7 @@ def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware
         if failure == "fork":
             assert drive.lines.readline().split() == ["forked", "NotOpenError"]
             t_s = time.monotonic()
-            wait_for(lambda: len([e for e in firmware.log.motor(t_s) if e.value == 3.0]) > 20)
+            until(lambda: len([e for e in firmware.log.motor(t_s) if e.value == 3.0]) > 20)
             drive.process.send_signal(signal.SIGINT)
         if failure == "forked_worker_then_sigkill":
             worker = int(drive.lines.readline())
@@ -260,7 +252,7 @@ def test_suspended_sender_is_detected_and_cannot_move_the_car_later(firmware: Se
         assert "error ActuatorFaultError The sender process hangs" in line
         t_s = time.monotonic()
         os.kill(drive.sender_pid, signal.SIGCONT)
-        wait_for(lambda: len(firmware.log.motor(t_s)) > 10)
+        until(lambda: len(firmware.log.motor(t_s)) > 10)
         assert drive.process.stdin is not None
         drive.process.stdin.write("continue\n")
         output = drive.end()
@@ -284,7 +276,7 @@ def test_unplugging_latches_a_fault_and_the_firmware_times_out(firmware: SerialF
 def test_sender_whose_wake_line_closes_sends_neutral_and_ends(firmware: SerialFirmware) -> None:
     with firmware:
         sender = SenderProcess(ActuatorConfig(port=firmware.port), ActuatorCalibration())
-        wait_for(lambda: len(firmware.log.motor()) > 3)
+        until(lambda: len(firmware.log.motor()) > 3)
         sender.close()
         assert sender._process.returncode == 0, "the sender ended by itself"
         assert firmware.log.wait_for("hang_up", TIMEOUT_S) is not None
@@ -298,7 +290,7 @@ def test_sender_ends_if_the_main_process_dies_while_it_starts(firmware: SerialFi
             assert process.stdout is not None
             sender, worker = map(int, process.stdout.readline().split())
             try:
-                wait_for(lambda: not Path(f"/proc/{sender}").exists())
+                until(lambda: not Path(f"/proc/{sender}").exists())
             finally:
                 for pid in (worker, sender):
                     with contextlib.suppress(ProcessLookupError):
@@ -311,7 +303,7 @@ def test_closing_does_not_wait_for_a_sender_that_cannot_be_killed(
     """As in the kernel's wait for a device that hangs, where no signal ends a process."""
     with firmware:
         sender = SenderProcess(ActuatorConfig(port=firmware.port), ActuatorCalibration())
-        wait_for(lambda: len(firmware.log.motor()) > 3)
+        until(lambda: len(firmware.log.motor()) > 3)
         os.kill(sender.pid, signal.SIGSTOP)
         monkeypatch.setattr(sender._process, "kill", lambda: None)
         begin_s = time.monotonic()

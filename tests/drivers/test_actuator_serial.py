@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,10 +32,10 @@ from drivers.links.serial_link import SerialLink
 from drivers.sender.logic import SenderState
 from drivers.vesc.payloads import FirmwareVersion, MotorValues, get_values, set_current
 from drivers.vesc.serial_codec import encode_frame
+from tests.helpers.waiting import TIMEOUT_S, until
 
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)  # 3 A, servo 0.65
-TIMEOUT_S = 20.0
 
 
 def config_for(firmware: SerialFirmware, **changes: object) -> ActuatorConfig:
@@ -44,14 +44,6 @@ def config_for(firmware: SerialFirmware, **changes: object) -> ActuatorConfig:
         port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
     )
     return replace(config, **changes)  # type: ignore[arg-type]
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition; fail after ``TIMEOUT_S``."""
-    end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end_s, "the condition was not met in time"
-        time.sleep(0.002)
 
 
 @pytest.fixture

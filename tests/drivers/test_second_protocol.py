@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,10 +18,10 @@ from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from drivers.device_kinds import DEVICE_KINDS
 from drivers.sender.process import SenderProcess
+from tests.helpers.waiting import until
 
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)
-TIMEOUT_S = 20.0
 
 
 @pytest.fixture(autouse=True)
@@ -40,13 +39,6 @@ def firmware() -> Iterator[ToyFirmware]:
 
 def config_for(port: str) -> ActuatorConfig:
     return ActuatorConfig("toy", port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end_s, "the condition was not met in time"
-        time.sleep(0.002)
 
 
 def test_commands_reach_the_firmware_and_stop_ends_in_neutral(firmware: ToyFirmware) -> None:

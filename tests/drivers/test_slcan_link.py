@@ -6,7 +6,7 @@ import os
 import time
 import tty
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -26,21 +26,14 @@ from drivers.links import slcan_link
 from drivers.links.link import CanFrame
 from drivers.links.slcan_link import SlcanLink, decode_line
 from drivers.sender.logic import SenderState
+from tests.helpers.waiting import until
 
 MOVING = Action(0.5, 0.3)
-TIMEOUT_S = 20.0
 
 
 def config_for(adapter: SlcanAdapter, **changes: Any) -> ActuatorConfig:
     common = {"watchdog_s": 2.0, "latch_s": 30.0, "telemetry_stale_s": 5.0, "telemetry_lost_s": 10.0}
     return ActuatorConfig(kind="vesc_can", interface="slcan", channel=adapter.port, **(common | changes))
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end_s, "the condition was not met in time"
-        time.sleep(0.002)
 
 
 @pytest.fixture

@@ -45,6 +45,6 @@ class Conditions:
 
 
 def with_stamp_delays(table: Table, mean_s: float, period_s: float, rng: np.random.Generator) -> Table:
-    """The recording with stamps of a logger that receives each row late by an exponential delay; the order is kept."""
+    """The recording with stamps of a logger that receives each row late by an exponential delay, in order."""
     delays = np.minimum(rng.exponential(mean_s, len(table["t"])), MAX_DELAY_PERIODS * period_s)
     return {**table, "t": table["t"] + delays}

@@ -36,9 +36,9 @@ def _lag(channel: int) -> SizedChange:
         out = series.copy()
         lag, state = max(value, 1e-4), 0.0
         for k, (wanted, step_s) in enumerate(zip(series[:, channel].tolist(), steps_s.tolist(), strict=True)):
-            kept = np.exp(-step_s / lag)
-            out[k, channel] = wanted + (state - wanted) * lag / step_s * (1.0 - kept)
-            state = wanted + (state - wanted) * kept
+            decay = np.exp(-step_s / lag)
+            out[k, channel] = wanted + (state - wanted) * lag / step_s * (1.0 - decay)
+            state = wanted + (state - wanted) * decay
         return out
 
     return smooth

@@ -138,11 +138,11 @@ def soft_patch(now: Instant, p: Parameters, car: BaseCar) -> None:
     cos, sin = math.cos(now.psi), math.sin(now.psi)
     for along in (car.front_axle, -car.rear_axle):
         away = math.hypot(now.x + along * cos - x, now.y + along * sin - y)
-        kept = 1.0 - 0.5 * loss * (1.0 - math.tanh((away - radius) / 0.08))
+        grip_share = 1.0 - 0.5 * loss * (1.0 - math.tanh((away - radius) / 0.08))
         if along > 0.0:
-            now.mu_f *= kept
+            now.mu_f *= grip_share
         else:
-            now.mu_r *= kept
+            now.mu_r *= grip_share
 
 
 @hook("load", first=True)

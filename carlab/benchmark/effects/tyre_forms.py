@@ -105,9 +105,9 @@ def roll_dynamics(world: World, p: Parameters) -> None:
     angle, rate = world.add_state(), world.add_state()
 
     def roll(now: Instant) -> None:
-        kept = max(1.0 - loss * now.extra[angle] ** 2, 0.2)
-        now.ff *= kept
-        now.fr *= kept
+        grip_share = max(1.0 - loss * now.extra[angle] ** 2, 0.2)
+        now.ff *= grip_share
+        now.fr *= grip_share
         side = (now.ff * now.cos_d + now.fr) / (world.car.mass * GRAVITY_MPS2)
         now.rates[angle] = now.extra[rate]
         now.rates[rate] = w * w * (side - now.extra[angle]) - 2 * z * w * now.extra[rate]

@@ -140,15 +140,15 @@ class Proof(SealedRun):
         unlike = set(answer.get("conditions", ())) - {"short recording", "feedback only"}
         if answer["fault"] is not None or unlike or any(effect not in CHEAP for effect in (one, other)):
             return None
-        kept = self.root / "checks" / f"{name}.json"
-        known = read_json(kept) if kept.exists() else {}
+        path = self.root / "checks" / f"{name}.json"
+        known = read_json(path) if path.exists() else {}
         key = " ".join(sorted((one, other)))
         if key not in known:
             folder = self.root / "handed" / name
             fit, hold = (read_csv(folder / file) for file in FILES[:2])
             floor = np.array([answer["floor"][channel] for channel in COLUMNS[1:7]])
             known[key] = indistinguishable(one, other, BaseCar.read(folder / "car.toml"), fit, hold, floor)
-            write_json(kept, known)
+            write_json(path, known)
         return None if known[key] is None else bool(known[key])
 
     def _handed(self, name: str) -> dict[str, bytes]:

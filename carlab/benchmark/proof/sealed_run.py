@@ -65,12 +65,12 @@ class SealedRun:
             if foreign:
                 raise DataError(f"{self.root} contains other files ({foreign[0]}); name a new folder for the proof.")
             write_json(path, {"plan": self._plan, "names": [secrets.token_hex(8) for _ in self._plan]})
-        kept = read_json(path)
-        if kept["plan"] != self._plan:
+        stored = read_json(path)
+        if stored["plan"] != self._plan:
             raise DataError(
                 f"{self.root} contains a proof of other cases or files; use the same ones or another folder."
             )
-        return list(kept["names"])
+        return list(stored["names"])
 
     def seal(self) -> str:
         """Hash the answers once; the hash is written to seal.json and passed to ``progress``."""

@@ -111,7 +111,7 @@ def parts(recordings: Mapping[str, Table]) -> list[Part]:
 
 def reference(recordings: Mapping[str, Table], left_out: Part) -> list[Table]:
     """The untouched recordings of a reference: everything but the pieces and ``GUARD_S`` before and after each."""
-    kept = []
+    chosen = []
     for name, table in recordings.items():
         for begin_s, end_s in _stretches(table["t"]):
             edges = [begin_s]
@@ -119,12 +119,12 @@ def reference(recordings: Mapping[str, Table], left_out: Part) -> list[Table]:
                 if piece.recording == name and begin_s <= piece.begin_s < end_s:
                     edges += [piece.begin_s - GUARD_S, piece.end_s + GUARD_S]
             edges.append(end_s)
-            kept += [
+            chosen += [
                 cut(table, a, b)
                 for a, b in zip(edges[::2], edges[1::2], strict=True)
                 if b - a >= MIN_REFERENCE_STRETCH_S
             ]
-    return kept
+    return chosen
 
 
 def cut(table: Table, begin_s: float, end_s: float) -> Table:

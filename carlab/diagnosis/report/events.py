@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from carlab.diagnosis.events import Event, EventUse
-from carlab.diagnosis.findings import Diagnosis, FitErrors, most_complete
+from carlab.diagnosis.findings import Diagnosis, FitErrors, final_model_name
 from carlab.diagnosis.report.numbers import number, with_unit
 
 KINDS = {"impact": "impact", "carried": "carried sideways"}
@@ -31,7 +31,7 @@ def event_sentences(use: EventUse, without: FitErrors | None = None, with_them: 
 
 def diagnosed_event_sentences(diagnosis: Diagnosis) -> list[str]:
     """The same for the most complete model of a diagnosis, which model.toml contains."""
-    name = most_complete(diagnosis.held_out)
+    name = final_model_name(diagnosis.held_out)
     return event_sentences(diagnosis.events, diagnosis.held_out.get(name), diagnosis.held_out_with_events.get(name))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, most_complete
+from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, final_model_name
 from carlab.diagnosis.settings import DEFAULT
 
 
@@ -19,7 +19,7 @@ def explained_share(diagnosis: Diagnosis, model: str = "with_effects") -> float:
 
 def remaining_share(diagnosis: Diagnosis) -> float:
     """Share of the refit's squared excess that remains with model.toml; NaN if unknown."""
-    return 1.0 - explained_share(diagnosis, most_complete(diagnosis.held_out))
+    return 1.0 - explained_share(diagnosis, final_model_name(diagnosis.held_out))
 
 
 def shown_errors(diagnosis: Diagnosis) -> dict[str, FitErrors]:

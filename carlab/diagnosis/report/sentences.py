@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
-from carlab.diagnosis.report.integration_error import integration_sentence
 from carlab.diagnosis.report.numbers import listed as listed
 from carlab.diagnosis.report.numbers import number as number
 from carlab.diagnosis.report.numbers import percent as percent
@@ -215,7 +214,6 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         _with_curves(diagnosis),
         _with_drift(diagnosis),
         search_sentences(diagnosis.search),
-        integration_sentence(diagnosis, CHANNEL_NAMES),
     )
     return f"{worse_than_constant_velocity(diagnosis)}{sentence_of_verdict(diagnosis)}{''.join(tails)}"
 

@@ -110,6 +110,6 @@ def _offset(path: _Course, mean: float) -> float:
     offset = mean
     if float(np.std(design[:, 1])) >= 1e-6:
         fitted = mean + float(np.linalg.lstsq(design, away[near], rcond=None)[0][0])
-        offset = min(mean, fitted, key=abs)  # always turning alike, the fit extrapolates; tightly, the mean is biased
+        offset = min(mean, fitted, key=abs)  # the fit extrapolates if all turns are alike; tight turns bias the mean
     is_reversed = abs(offset) > LIMITS.slip_rad and np.mean(is_forward) < 0.5
     return float(wrap(offset + np.pi)) if is_reversed else offset
