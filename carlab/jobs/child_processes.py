@@ -24,6 +24,11 @@ OUTPUT_TAIL_BYTES = 2000
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 KILL_AT_END_OF_INPUT = ("/bin/sh", "-c", 'read line || kill -s KILL -- "-$0"')
 """Command that waits for the end of its standard input and then kills the process group of its argument."""
+START_AFTER_LINE = ("/bin/sh", "-c", 'read line && exec "$@" <"$0"')
+"""Command that waits for a line of its standard input and then becomes the command that follows.
+
+The first argument is the file that the command reads as its standard input. Without the line nothing is started.
+"""
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -65,18 +70,19 @@ def run_child(
     """
     clock = MonotonicClock()
     inherited = {k: v for k, v in os.environ.items() if k != "PWD"}
-    with tempfile.TemporaryFile() as output_file, tempfile.TemporaryFile() as input_file:
+    with tempfile.TemporaryFile() as output_file, tempfile.NamedTemporaryFile() as input_file:
         input_file.write(stdin_text.encode())
-        input_file.seek(0)
+        input_file.flush()
         begin_s = clock.now_s()
         child = subprocess.Popen(
-            command, cwd=folder, env={**inherited, **(environment or {})}, stdin=input_file, stdout=output_file,
-            stderr=subprocess.STDOUT, start_new_session=True,
+            (*START_AFTER_LINE, input_file.name, *command), cwd=folder, env={**inherited, **(environment or {})},
+            stdin=subprocess.PIPE, stdout=output_file, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         too_long = abandoned = False
         ended = 0
         try:
             with _killed_with_this_process(child.pid):
+                _write_line(child)
                 while not ended:
                     ended, status, usage = os.wait4(child.pid, os.WNOHANG)
                     if ended:
@@ -104,8 +110,9 @@ def run_child(
 def _killed_with_this_process(pid: int) -> Iterator[None]:
     """Kill the session of a child if this process is killed before the block ends.
 
-    A shell waits for the end of a pipe, of which only this process has the other end. PR_SET_PDEATHSIG would need code
-    between fork and exec, and would reach neither the children of the child nor outlive the thread that started it.
+    The child waits for a line (``START_AFTER_LINE``) until this block has begun. A shell waits for the end of a pipe,
+    of which only this process has the other end. PR_SET_PDEATHSIG would need code between fork and exec, and would
+    reach neither the children of the child nor outlive the thread that started it.
     """
     to_read, to_write = os.pipe()
     try:
@@ -121,6 +128,12 @@ def _killed_with_this_process(pid: int) -> Iterator[None]:
     finally:
         os.close(to_read)
         os.close(to_write)
+
+
+def _write_line(child: subprocess.Popen[bytes]) -> None:
+    assert child.stdin is not None
+    with suppress(BrokenPipeError), child.stdin as stdin:  # the child may have been killed
+        stdin.write(b"\n")
 
 
 def _kill_session(pid: int) -> None:

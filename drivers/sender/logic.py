@@ -11,7 +11,8 @@ from drivers.config import ActuatorConfig
 from drivers.device import FirmwareIdentity, Telemetry
 
 NEUTRAL_FRAMES = 3
-NEUTRAL_SPAN_S = 0.06
+NEUTRAL_SPAN_S = 0.12
+"""The controller must receive neutral over at least 60 ms. It may receive the first frame late: twice that."""
 
 
 class SenderState(enum.IntEnum):
@@ -110,7 +111,7 @@ class SenderLogic:
 
     @property
     def is_neutral_settled(self) -> bool:
-        """Whether neutral has been sent at least three times over at least 60 ms since the last moving command."""
+        """Whether neutral has been sent at least three times over at least 120 ms since the last moving command."""
         return self._is_neutral_settled
 
     def link_up(self) -> None:

@@ -111,7 +111,7 @@ class SenderLoop:
                 deadline_s += (missed + 1) * self._period_s
 
     def _send_last_neutral(self) -> None:
-        """Write neutral three times over 60 ms, if the link is open and the firmware known; ignores errors."""
+        """Write neutral three times over 120 ms, if the link is open and the firmware known; ignores errors."""
         for _ in range(NEUTRAL_FRAMES if self._is_link_open and self.logic.is_ready_to_send else 0):
             with contextlib.suppress(Exception):
                 self.device.send(self.logic.neutral)

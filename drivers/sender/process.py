@@ -2,7 +2,7 @@
 
 It is started as ``python -m drivers.sender.process`` and not by ``multiprocessing``: the main program is not imported
 again, no shared name can leak, and a terminal's ^C does not reach it. It ignores SIGINT, SIGTERM and SIGHUP. It ends
-on request, or when the main process has ended, and always after at least three neutral frames over at least 60 ms.
+on request, or when the main process has ended, and always after at least three neutral frames over at least 120 ms.
 """
 
 from __future__ import annotations

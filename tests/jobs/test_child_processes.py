@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import signal
 import subprocess
 import sys
 import threading
@@ -31,6 +32,16 @@ command = (sys.executable, "-c", sys.argv[2], sys.argv[1])
 waiting = threading.Thread(target=run_child, args=(command, Path(sys.argv[1]).parent), kwargs={"timeout_s": 60.0})
 waiting.start()
 """
+DIES_BEFORE_GUARD = """
+import os, signal, subprocess
+start = subprocess.Popen
+def start_only_the_child(command, **settings):
+    if "kill" in command[2]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return start(command, **settings)
+subprocess.Popen = start_only_the_child
+"""
+"""Kills the worker after the start of the child and before that of the process that watches over it."""
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
@@ -58,6 +69,20 @@ def test_killed_parent_takes_its_child_and_its_grandchild_with_it(tmp_path: Path
         assert not is_free(lock)
         worker.kill()
     assert wait_for(lambda: is_free(lock))
+
+
+def test_parent_killed_while_it_starts_a_child_leaves_no_child(tmp_path: Path) -> None:
+    lock = tmp_path / "lock"
+    worker = subprocess.run([sys.executable, "-c", DIES_BEFORE_GUARD + WORKER, str(lock), JOB], check=False)
+    assert worker.returncode == -signal.SIGKILL
+    assert not wait_for(lock.exists, seconds=1.0)
+
+
+@pytest.mark.parametrize("stdin_text", ["", "one\ntwo\n", "x" * 200_000])
+def test_child_reads_all_of_its_standard_input(tmp_path: Path, stdin_text: str) -> None:
+    program = "import sys; print(len(sys.stdin.read()))"
+    end = run_child((sys.executable, "-c", program), tmp_path, timeout_s=60.0, stdin_text=stdin_text)
+    assert (end.exit_status, end.output) == (0, f"{len(stdin_text)}\n")
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts open files in /proc")
