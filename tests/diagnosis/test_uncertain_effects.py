@@ -1,9 +1,10 @@
-"""Withdrawal of effects whose numbers do not differ from their identity."""
+"""Withdrawal of effects whose numbers do not differ from their identity, or that raise the held-out error."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import huber as huber_loss
 
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import ScoredSearch
@@ -14,6 +15,9 @@ from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.uncertain_effects import identity_distance, without_uncertain_effects
+from carlab.diagnosis.weak_effects import without_harmful_effects
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
@@ -99,3 +103,26 @@ def test_distance_from_the_numbers_and_the_form_of_the_car_file() -> None:
 def test_fit_with_estimated_initial_states_decides_nothing(scored: ScoredSearch) -> None:
     estimated = replace(scored, is_joint=False)
     assert without_uncertain_effects(estimated, RunControl()) is estimated
+
+
+@pytest.mark.parametrize(
+    ("seed", "stands"), [(7, False), (8, False), (17, False), (10, True), (12, True), (4, True), (6, True)]
+)
+def test_effect_that_raises_both_held_out_errors_is_withdrawn(scored: ScoredSearch, seed: int, stands: bool) -> None:
+    """The rms error and Huber's loss decide on drives of the same car, which does not have the effect."""
+    true = replace(CAR, effects={LAG: {"time_constant": 0.05}})
+    windows = cut_windows(segments_of([drive(true, 30.0, seed)]), 0.8, 0.5)
+    problem, scale = scored.problem, scored.found.scale
+    best = refit(problem, (LAG, BRAKE), problem.fitter(scale).fit(CAR, ()), scale).fit
+    found = replace(scored.found, best=best)
+    without = refit(problem, (LAG,), best, scale).fit
+    before, after = (
+        prediction_errors(simulate_windows(windows, fit.config), windows)[0, :, -1] for fit in (without, best)
+    )
+    is_larger = np.mean((after / STD) ** 2) >= np.mean((before / STD) ** 2)
+    robust = np.maximum(1.4826 * np.median(np.abs(after), axis=0), 3.0 * STD)
+    loss_before, loss_after = (huber_loss(4.0, each / robust).sum() for each in (before, after))
+    assert stands == (not is_larger or loss_after < loss_before)
+    held_out = HeldOut(windows, 3.0 * STD, Noise(STD, STD))
+    confirmed = without_harmful_effects(problem, found, held_out, RunControl())
+    assert confirmed.effects == ((LAG, BRAKE) if stands else (LAG,))

@@ -106,9 +106,10 @@ class SelectionSettings:
     the score by at least 0.5 noise floors."""
     min_held_out_rise: float = 0.0
     """Minimum relative rise of the held-out score without an effect."""
-    min_held_out_z: float = -1.0
+    min_held_out_z: float = 0.0
     """Alternative: minimum fall of the held-out log-likelihood without the effect [standard errors]. The score gives
-    much weight to single windows, for example in a spin; the robust likelihood does not."""
+    much weight to single windows, for example in a spin; the robust likelihood does not. An effect that neither of the
+    two supports is removed."""
     tie_z: float = 2.0
     """Another path replaces the greedy path if its loss on left-out blocks is lower by this [standard errors]."""
     indistinguishable_z: float = 3.0
