@@ -80,6 +80,11 @@ class DiagnosisReport:
         return dict(self.diagnosis.parameters)
 
     @property
+    def limits(self) -> dict[str, dict[str, Estimate]]:
+        """How large each effect without a name can be, by id and number: linear estimates with 90 % intervals."""
+        return {effect: dict(own) for effect, own in self.diagnosis.limits.items()}
+
+    @property
     def held_out(self) -> dict[str, FitErrors]:
         """Held-out root mean square errors by model, as ``fit.held_out`` of report.json."""
         return dict(self.diagnosis.held_out)

@@ -32,6 +32,7 @@ from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, Recordin
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
+from carlab.diagnosis.limits import effect_limits
 from carlab.diagnosis.naming import (
     NamingResult,
     accept_names,
@@ -273,6 +274,7 @@ def _assemble_result(
         ),
         drift=() if adaptation is None else adaptation.drift,
         car_file_parameters=_stated_parameters(request.nominal),
+        limits=effect_limits(scored),
         events=recordings.events,
         held_out_with_events=errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )

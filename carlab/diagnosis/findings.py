@@ -259,8 +259,8 @@ class Diagnosis:
     with a discrepancy also with_discrepancy. ``held_out_with_events`` has the same models, scored with the windows that
     events left out; empty without such windows. ``fitted_score`` is that of with_effects on the windows that were
     fitted; NaN if unknown. ``car_file_parameters`` has the value of each of the ``parameters`` in
-    the car file, if it states one. ``curve_trial`` is None without measured curves as a stage, and if the
-    user ended it.
+    the car file, if it states one. ``limits`` has the numbers that each effect without a name may have, by effect and
+    number. ``curve_trial`` is None without measured curves as a stage, and if the user ended it.
     """
 
     verdict: Verdict
@@ -282,6 +282,7 @@ class Diagnosis:
     skill: tuple[Skill, ...] = ()
     drift: tuple[Drift, ...] = ()
     car_file_parameters: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     search: SearchExtent = field(default_factory=SearchExtent)
     events: EventUse = field(default_factory=EventUse)
     held_out_with_events: Mapping[str, FitErrors] = field(default_factory=dict)
@@ -311,6 +312,7 @@ class Diagnosis:
                 name: {**asdict(e), "car_file": self.car_file_parameters.get(name)}
                 for name, e in self.parameters.items()
             },
+            "limits": {effect: {k: asdict(e) for k, e in own.items()} for effect, own in self.limits.items()},
             "fit": {
                 "horizon_s": self.horizon_s,
                 "fitted_score": self.fitted_score,

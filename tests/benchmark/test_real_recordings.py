@@ -285,6 +285,16 @@ def test_size_against_an_infinite_identity_has_no_standard_deviations() -> None:
     assert score_comparison(truth, named, stated)["sizes"][0]["stds"] == pytest.approx(15.0)
 
 
+def test_standard_deviation_of_an_effect_without_a_name_is_that_of_its_limit() -> None:
+    truth = answer("command_delay", ["command_delay", "mocap_latency"], parameter="extra_delay", size=0.045)
+    limits = {"mocap_latency": {"latency": {"value": 0.02, "std": 0.015, "low90": 0.0, "high90": 0.045}}}
+    row = score_comparison(truth, {**report(), "limits": limits}, {"mocap": {"latency": 0.008}})
+    rows = {"unnamed": row}
+    add_visibility(rows)
+    assert rows["unnamed"]["stds"] == pytest.approx(3.0)
+    assert score_comparison(truth, {**report(), "limits": {}}, {})["unnamed_stds"] is None
+
+
 def test_change_to_a_value_counts_from_the_value_in_the_first_group() -> None:
     truth = answer(
         "steering_nonlinearity", ["steering_nonlinearity"], parameter="saturation", size=0.9, composes="replaces",

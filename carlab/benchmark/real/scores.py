@@ -86,16 +86,25 @@ def _correctness(change: Json, names: Set[str]) -> Correctness:
 
 def _unnamed_stds(effect: Json, report: Json | None, model: Json) -> float | None:
     """True size in standard deviations of the tool's estimate of an effect that it does not name."""
-    for tested in (report or {}).get("tested", []):
+    truth, estimates = effect["truth"][0], report or {}
+    for name in effect["names"]:
+        limits = estimates.get("limits", {}).get(name, {})
+        parameter = next(iter(limits)) if len(limits) == 1 else truth["parameter"]
+        if parameter in limits:
+            return _size({**truth, "parameter": parameter}, name, model) / max(float(limits[parameter]["std"]), 1e-12)
+    for tested in estimates.get("tested", []):
         values = tested["parameters"]
         if tested["id"] in effect["names"] and len(values) == 1 and tested["standard_errors"] > 0.0:
-            truth = effect["truth"][0]
-            value = next(iter(values.values()))
-            true = true_value(truth, tested["id"], model) - _before(tested["id"], truth["parameter"], model)
-            if math.isinf(true):
+            size = _size(truth, tested["id"], model)
+            if math.isinf(size):
                 return None
-            return abs(true) * float(tested["standard_errors"]) / max(abs(float(value)), 1e-12)
+            return size * float(tested["standard_errors"]) / max(abs(float(next(iter(values.values())))), 1e-12)
     return None
+
+
+def _size(truth: Json, name: str, model: Json) -> float:
+    """Distance of the changed car's value from that of the reference's car file."""
+    return abs(true_value(truth, name, model) - _before(name, truth["parameter"], model))
 
 
 def _sizes(effect: Json, change: Json, model: Json) -> list[dict[str, Any]]:

@@ -283,6 +283,11 @@ class Fitter:
         design_effects = np.diag(sandwich) / np.maximum(np.diag(bread), 1e-30)
         return replace(fit, covariance=sandwich, design_effects=design_effects)
 
+    def gauss_newton_step(self, fit: Fit, linearisation: Linearisation) -> FloatArray:
+        """Change (n,) of the coordinates of a fit that minimises the linearised loss with its prior."""
+        normal, score = self._normal(fit, *linearisation)
+        return np.asarray(-np.linalg.pinv(normal) @ (score.sum(axis=1) + self.precision(fit.free) @ fit.z))
+
     def leave_fold_out_loss(
         self, fit: Fit, folds: IndexArray, max_error: float, linearisation: Linearisation | None = None
     ) -> FloatArray:

@@ -78,6 +78,11 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "parameters": [
             (name, diagnosis.car_file_parameters.get(name), e, _bar(e)) for name, e in diagnosis.parameters.items()
         ],
+        "limits": [
+            (text.effect_noun(effect), f"{effect}.{name}", e, _bar(e))
+            for effect, own in diagnosis.limits.items()
+            for name, e in own.items()
+        ],
         "channels": text.CHANNEL_NAMES,
     }
 

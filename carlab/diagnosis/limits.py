@@ -1,0 +1,99 @@
+"""Sizes that an effect without a name may have: how strong an effect the recordings would have shown.
+
+The estimate is one Gauss-Newton step from the identity of the effect, together with the other parameters of the fit (a
+score test, Rao 1948). The slope is that of the secant to a finite size, because a dead band has no slope at its
+identity. It is the size at which the resulting interval ends.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.evidence import ScoredSearch
+from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.identification.fit import Fit, Fitter, Linearisation
+from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
+from carlab.diagnosis.settings import EvidenceSettings
+from sim_backends.effects import CATALOGUE
+from sim_backends.registry import REGISTRY
+
+SECANT_ROUNDS = 3
+"""Number of times that the secant ends where the interval ends."""
+MIN_SIZE = 1e-9
+"""Size of a coordinate below which it is at the end of its range."""
+MIN_INFORMATION = 1e-6
+"""Mean square change of the whitened errors per typical size below which a number has no influence."""
+
+
+def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
+    """Estimates of the numbers of each candidate that is not named, by effect and number.
+
+    Effects are omitted if a number of theirs has an infinite identity, or no influence at the identities of the others.
+    """
+    problem, found = scored.problem, scored.found
+    fitter = problem.fitter(found.scale)
+    fit = replace(scored.fit, config=problem.config_with(found.effects))
+    linearised = fitter.linearised(scored.fit)
+    limits = {}
+    for effect in CATALOGUE:
+        if effect in found.effects or not problem.is_candidate(effect):
+            continue
+        free = tuple(p for p in effect_parameters(effect, problem.nominal) if not p.choice)
+        if not any(p.logarithmic for p in free):
+            joint = replace(
+                fit,
+                config=with_effect(fit.config, effect),
+                free=(*fit.free, *free),
+                z=np.concatenate([fit.z, np.zeros(len(free))]),
+            )
+            limits[effect] = _limits(fitter, joint, linearised, problem.settings.evidence)
+    return {effect: parameters for effect, parameters in limits.items() if parameters}
+
+
+def _limits(fitter: Fitter, joint: Fit, linearised: Linearisation, settings: EvidenceSettings) -> dict[str, Estimate]:
+    """Estimates of the last coordinates of ``joint``, which ``linearised`` lacks; empty if one has no influence."""
+    count = len(linearised.jacobian)
+    added = joint.free[count:]
+    sizes = np.ones(len(added))
+    for _ in range(SECANT_ROUNDS):
+        secants = _secants(fitter, joint, sizes, linearised.white)
+        if np.mean(secants**2, axis=(1, 2, 3)).min(initial=math.inf) < MIN_INFORMATION:
+            return {}
+        jacobian = np.concatenate([linearised.jacobian, secants])
+        step = fitter.gauss_newton_step(joint, Linearisation(jacobian, linearised.white))
+        left = linearised.white + np.tensordot(step, jacobian, axes=1)
+        covariance = fitter.with_covariance(joint, Linearisation(jacobian, left)).covariance
+        assert covariance is not None
+        std = settings.interval_factor * np.sqrt(np.diag(covariance)[count:])
+        sizes = np.abs(step[count:]) + settings.interval_z * std
+    estimates = [_estimate(p, z, s, settings.interval_z) for p, z, s in zip(added, step[count:], std, strict=True)]
+    return {p.name.rpartition(".")[2]: estimate for p, estimate in zip(added, estimates, strict=True)}
+
+
+def _secants(fitter: Fitter, joint: Fit, sizes: FloatArray, white: FloatArray) -> FloatArray:
+    """Changes (n, S, U, 6) of the whitened errors per unit of each of the last n coordinates, at the sizes (n,).
+
+    The mean of both signs, if the range of the number allows both.
+    """
+    secants = []
+    for k, size in enumerate(sizes, start=len(joint.free) - len(sizes)):
+        p = joint.free[k]
+        ends = [p.coordinate(float(p.value(np.array(sign * size)))) for sign in (1.0, -1.0)]
+        points = np.tile(joint.z, (2, 1))
+        points[:, k] = ends
+        moved = fitter.white(joint.config, joint.free, points)
+        slopes = [(each - white) / end for each, end in zip(moved, ends, strict=True) if abs(end) > MIN_SIZE]
+        secants.append(np.mean(slopes, axis=0) if slopes else np.zeros_like(white))
+    return np.asarray(secants)
+
+
+def _estimate(p: FitParameter, z: float, std: float, z90: float) -> Estimate:
+    low, value, high = (float(p.value(np.array(z + k * std))) for k in (-z90, 0.0, z90))
+    return Estimate(value, float(std * p.size), min(low, high), max(low, high), REGISTRY[p.name].unit)
+
+
+__all__ = ["effect_limits"]

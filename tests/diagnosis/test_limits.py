@@ -1,0 +1,87 @@
+"""Limits of effects without a name, against fits of these effects and the truth of simulated cars."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from carlab.diagnosis.evidence import ScoredSearch
+from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.identification.measurement_noise import Noise
+from carlab.diagnosis.limits import effect_limits
+from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
+from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.settings import DEFAULT
+from carlab.prediction.windows import cut_windows, segments_of
+from sim_backends import SimulatorConfig
+from sim_backends.car_parameters import MocapParameters
+from tests.helpers.recorded_drives import PERIOD_S, drive
+
+CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
+STD = 3e-4 * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
+FITTED = (
+    "steering_lag", "command_delay", "steering_offset", "steering_deadband", "steering_backlash", "throttle_deadband",
+    "yaw_damping", "marker_offset", "aerodynamic_drag",
+)  # fmt: skip
+
+
+def searched(true: SimulatorConfig) -> ScoredSearch:
+    """A search that named nothing, for a drive of a car."""
+    windows, held_out = (
+        cut_windows(segments_of([drive(true, s, seed)]), 0.8, 0.5) for s, seed in ((60.0, 3), (9.0, 4))
+    )
+    problem = SearchProblem(CAR, windows, 3.0 * STD, STD, {})
+    scale = Scale(np.array([8, 16, 24]), np.tile(3.0 * STD, (3, 1)))
+    base = refit(problem, (), problem.fitter(scale).fit(CAR, ()), scale).fit
+    found = SearchResult(base, base, (), {}, {}, (), (), scale)
+    fit = problem.fitter(scale).with_covariance(base)
+    return ScoredSearch(problem, found, HeldOut(held_out, 3.0 * STD, Noise(STD, STD)), fit, {})
+
+
+@pytest.fixture(scope="module")
+def correct() -> ScoredSearch:
+    return searched(CAR)
+
+
+@pytest.fixture(scope="module")
+def limits(correct: ScoredSearch) -> dict[str, dict[str, Estimate]]:
+    return effect_limits(correct)
+
+
+@pytest.mark.parametrize("effect", FITTED)
+def test_limits_agree_with_fits_of_the_effect(
+    correct: ScoredSearch, limits: dict[str, dict[str, Estimate]], effect: str
+) -> None:
+    problem, scale = correct.problem, correct.found.scale
+    fit = problem.fitter(scale).with_covariance(refit(problem, (effect,), correct.fit, scale).fit)
+    assert fit.covariance is not None
+    for name, limit in limits[effect].items():
+        k = [f.name for f in fit.free].index(f"effects.{effect}.{name}")
+        std = DEFAULT.evidence.interval_factor * fit.free[k].size * np.sqrt(fit.covariance[k, k])
+        assert limit.std == pytest.approx(std, rel=0.35)
+        assert limit.value == pytest.approx(fit.config.values()[fit.free[k].name], abs=0.5 * std)
+        assert limit.low90 <= limit.value <= limit.high90
+
+
+def test_limits_of_a_correct_car_contain_the_identities(limits: dict[str, dict[str, Estimate]]) -> None:
+    intervals = [e for own in limits.values() for e in own.values()]
+    assert len(intervals) >= 25
+    identities = {"exponent": 1.0, "gain_ratio": 1.0}
+    contained = [e.low90 <= identities.get(name, 0.0) <= e.high90 for own in limits.values() for name, e in own.items()]
+    assert np.mean(contained) >= 0.8
+
+
+@pytest.mark.parametrize(
+    ("effect", "name", "size"), [("steering_lag", "time_constant", 0.003), ("steering_offset", "angle", -0.001)]
+)
+def test_limit_contains_a_small_effect_that_has_no_name(effect: str, name: str, size: float) -> None:
+    limit = effect_limits(searched(replace(CAR, effects={effect: {name: size}})))[effect][name]
+    assert limit.low90 < size < limit.high90
+    assert abs(limit.value) > 3.0 * limit.std
+
+
+def test_effects_without_a_linear_estimate_are_omitted(limits: dict[str, dict[str, Estimate]]) -> None:
+    """A patch and a slope without size have no place; a limit of infinity has no slope."""
+    assert not {"low_friction_patch", "road_slope", "steering_rate_limit", "motor_saturation"} & set(limits)
