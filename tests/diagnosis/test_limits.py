@@ -6,17 +6,21 @@ import numpy as np
 import pytest
 
 from carlab.diagnosis.evidence import ScoredSearch
-from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.findings import Estimate, FigureData
 from carlab.diagnosis.identification.fit import Scale
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.limits import effect_limits
+from carlab.diagnosis.report.html_page import render_page
+from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
+from sim_backends.effects import CATALOGUE
+from tests.diagnosis.report_material import no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
@@ -85,3 +89,21 @@ def test_limit_contains_a_small_effect_that_has_no_name(effect: str, name: str, 
 def test_effects_without_a_linear_estimate_are_omitted(limits: dict[str, dict[str, Estimate]]) -> None:
     """A patch and a slope without size have no place; a limit of infinity has no slope."""
     assert not {"low_friction_patch", "road_slope", "steering_rate_limit", "motor_saturation"} & set(limits)
+
+
+def test_report_states_the_narrowest_limits(limits: dict[str, dict[str, Estimate]]) -> None:
+    diagnosis = replace(no_mismatch(), sentence="", limits=limits)
+    sentence = verdict_sentence(diagnosis)
+    assert "for example" not in verdict_sentence(replace(diagnosis, limits={}))
+    typical = {e: CATALOGUE[e].parameters[0].typical for e, own in limits.items() if len(own) == 1}
+    ends = {e: max(abs(x.low90), abs(x.high90)) for e in typical for x in limits[e].values()}
+    narrowest = min(
+        (e for e in typical if CATALOGUE[e].parameters[0].identity == 0.0), key=lambda e: ends[e] / abs(typical[e])
+    )
+    assert f"for example {CATALOGUE[narrowest].name} beyond {number(ends[narrowest])}" in sentence
+    page = render_page(diagnosis, FigureData())
+    assert page.count("Limits of the other effects") == 1
+    for effect, own in limits.items():
+        for name in own:
+            assert f"<code>{effect}.{name}</code>" in page
+    assert diagnosis.to_dict()["limits"]["steering_lag"]["time_constant"]["unit"] == "s"

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
+from carlab.diagnosis.report.limits import excluded_sizes
 from carlab.diagnosis.report.numbers import listed as listed
 from carlab.diagnosis.report.numbers import number as number
 from carlab.diagnosis.report.numbers import percent as percent
@@ -343,7 +344,7 @@ def _none(diagnosis: Diagnosis) -> str:
     return (
         f"{text} The position error after {with_unit(diagnosis.horizon_s, 's')} is {with_unit(held.position_m, 'm')}; "
         f"all channels: {number(held.score)} noise floors (a noise floor is the estimated error of measurement noise)."
-        f"{_warning_above_noise(diagnosis, 'nominal')}{_warning_of_fitted(diagnosis)}"
+        f"{excluded_sizes(diagnosis)}{_warning_above_noise(diagnosis, 'nominal')}{_warning_of_fitted(diagnosis)}"
     )
 
 

@@ -25,6 +25,8 @@ class ReportSettings:
     """Maximum number of rows in the table of candidate effects."""
     max_wrong_parameters: int = 3
     """Maximum number of parameters of the car file that the verdict sentence names."""
+    max_limits: int = 3
+    """Maximum number of effects in the sentence about sizes that the recordings exclude."""
     max_picture_names: int = 5
     """Maximum number of effects in the title of summary.png."""
     correlation_step_s: float = 0.2

@@ -1,0 +1,35 @@
+"""Sentence about the sizes of effects that recordings without missing physics exclude."""
+
+from __future__ import annotations
+
+from carlab.diagnosis.findings import Diagnosis, Estimate
+from carlab.diagnosis.report.numbers import listed, with_unit
+from carlab.diagnosis.settings import DEFAULT
+from sim_backends.effects import EFFECTS
+
+
+def excluded_sizes(diagnosis: Diagnosis) -> str:
+    """The narrowest limits, in typical sizes of the effects; empty without any.
+
+    Only effects with a single number, which is 0 without the effect.
+    """
+    found = []
+    for effect, own in diagnosis.limits.items():
+        numbers = [p for p in EFFECTS[effect].parameters if p.name in own]
+        if len(numbers) == 1 and numbers[0].identity == 0.0:
+            estimate = own[numbers[0].name]
+            found.append((_largest(estimate) / abs(numbers[0].typical), EFFECTS[effect].name, estimate))
+    narrowest = sorted(found, key=lambda each: each[0])[: DEFAULT.report.max_limits]
+    if not narrowest:
+        return ""
+    sizes = [f"{name} beyond {with_unit(_largest(e), e.unit)}" for _, name, e in narrowest]
+    example = listed(sizes)
+    return f" The recordings contradict larger effects (90 % intervals), for example {example}; the report lists all."
+
+
+def _largest(estimate: Estimate) -> float:
+    """Largest size within the 90 % interval."""
+    return max(abs(estimate.low90), abs(estimate.high90))
+
+
+__all__ = ["excluded_sizes"]
