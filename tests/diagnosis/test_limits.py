@@ -101,6 +101,8 @@ def test_report_states_the_narrowest_limits(limits: dict[str, dict[str, Estimate
         (e for e in typical if CATALOGUE[e].parameters[0].identity == 0.0), key=lambda e: ends[e] / abs(typical[e])
     )
     assert f"for example {CATALOGUE[narrowest].name} beyond {number(ends[narrowest])}" in sentence
+    stated = {f"effects.{narrowest}.{CATALOGUE[narrowest].parameters[0].name}": 0.1}
+    assert CATALOGUE[narrowest].name not in verdict_sentence(replace(diagnosis, car_file_parameters=stated))
     page = render_page(diagnosis, FigureData())
     assert page.count("Limits of the other effects") == 1
     for effect, own in limits.items():
