@@ -13,7 +13,7 @@ from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys, number
 from sim_backends.array_ops import FLOATS
 from sim_backends.effects import EFFECTS, DelayEffect, MeasuredCurve
-from sim_backends.effects.base import GRAVITY_MPS2, MODEL_KINDS, ModelKind
+from sim_backends.effects.base import MODEL_KINDS, ModelKind
 from sim_backends.measurement import LATENCY, MeasurementModel
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
@@ -303,15 +303,3 @@ def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None, 
             )
         return given["value"], (given["low"], given["high"]) if ranged else None, given.get("std")
     return number(entry, where), None, None
-
-
-__all__ = [
-    "GRAVITY_MPS2",
-    "LATENCY",
-    "TABLES",
-    "CarParameters",
-    "MocapParameters",
-    "ModelKind",
-    "SimulatorConfig",
-    "preset_names",
-]

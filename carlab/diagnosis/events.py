@@ -21,7 +21,8 @@ from carlab.diagnosis.settings import DEFAULT, EventSettings
 from carlab.prediction.windows import EVENT_COLUMN, body_states, unbroken_rows
 from carlab.recording.faults.robust import robust_std, runs
 from carlab.recording.pose_velocity import BoolArray
-from sim_backends.car_parameters import GRAVITY_MPS2, CarParameters, SimulatorConfig
+from sim_backends.car_parameters import CarParameters, SimulatorConfig
+from sim_backends.effects.base import GRAVITY_MPS2
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,6 +253,3 @@ def _merged(t_s: FloatArray, rows: BoolArray, merge_s: float) -> list[tuple[int,
     index = np.flatnonzero(rows)
     groups = np.split(index, np.flatnonzero(np.diff(t_s[index]) > merge_s) + 1) if len(index) else []
     return [(int(group[0]), int(group[-1])) for group in groups]
-
-
-__all__ = ["Event", "EventUse", "find_events", "grip_limits", "mark_events"]

@@ -23,7 +23,8 @@ from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.core.state_estimator import MIN_SAMPLES, fit_velocity
 from carlab.recording.episode_builder import POSE_AGE, VELOCITY_DELAY
-from sim_backends.car_parameters import LATENCY, SimulatorConfig
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.measurement import LATENCY
 
 HALF_WINDOW_S = 0.0251
 """Half of the quadratic's window: seven poses at 100 Hz and 120 Hz; at least two poses on each side."""
@@ -190,6 +191,3 @@ def _filter_offset(episode: EpisodeData, poses: FloatArray) -> FloatArray:
             line = fit_velocity(poses[end - counts[best] : end])
             difference[k] = episode.states[k, 3:] - (line.vx_mps, line.vy_mps, line.yaw_rate_radps)
     return np.asarray(difference)
-
-
-__all__ = ["align_states", "lost_frames", "naming_lost_frames", "window_variance_s2", "with_known_latency"]

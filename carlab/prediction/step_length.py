@@ -14,9 +14,8 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.array_ops import ARRAYS
-from sim_backends.car_parameters import ModelKind
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects.base import SLIP_FLOOR_MPS
+from sim_backends.effects.base import SLIP_FLOOR_MPS, ModelKind
 
 MAX_STEP_S = 0.017
 """Maximum integration step: at 30 Hz its error is below a hundredth of a noise floor."""

@@ -34,6 +34,3 @@ def record_pair(number: int, folder: Path, training_s: float, held_out_s: float)
     write_csv(folder / TRAINING_NAME, dict(case.fit))
     write_csv(folder / HELD_OUT_NAME, dict(case.hold))
     return pair
-
-
-__all__ = ["CAR_NAME", "HELD_OUT_NAME", "PAIRS", "TRAINING_NAME", "record_pair"]

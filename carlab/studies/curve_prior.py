@@ -59,6 +59,3 @@ def _part(episode: EpisodeData, first: int, end: int) -> EpisodeData:
         poses=poses[inside],
         extra={name: column[rows] for name, column in episode.extra.items()},
     )
-
-
-__all__ = ["unbroken_parts", "with_curves"]

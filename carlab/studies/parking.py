@@ -227,17 +227,3 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         axis.xaxis.get_major_locator().set_params(integer=True)
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
-
-
-__all__ = [
-    "FINAL_EPISODES",
-    "Curve",
-    "MethodFigures",
-    "as_json",
-    "check_run",
-    "draw",
-    "read_curve",
-    "run_folder",
-    "run_name",
-    "summarised",
-]

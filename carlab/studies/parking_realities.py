@@ -121,6 +121,3 @@ def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
 
 def _mean(values: Sequence[bool]) -> float:
     return float(np.mean(values)) if values else float("nan")
-
-
-__all__ = ["ARMS", "REALITIES", "ArmFigures", "arm_of", "compared", "write_reality"]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from carlab.experiment.campaign.campaign import check_period, prior_simulator
-from carlab.studies.regression.recordings import DELAY_S, RecordedCase, check_periods
+from carlab.studies.regression.recordings import DELAY_S, RecordedCase
 from carlab.studies.regression.scores import Score
 from carlab.studies.regression.study import Progress, scored
 from learning.priors.domain_models import DomainModel
@@ -139,16 +139,3 @@ def run_prior_study(
         )
         yield replace(score, method=name)
     progress("", len(plan), len(plan))
-
-
-__all__ = [
-    "DIAGNOSED",
-    "KINEMATIC",
-    "NOMINAL",
-    "NONE",
-    "InDomain",
-    "check_periods",
-    "checked_counts",
-    "prior_models",
-    "run_prior_study",
-]

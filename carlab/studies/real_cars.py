@@ -129,6 +129,3 @@ def as_json(errors: Sequence[RealCarError], command: str, split: Mapping[str, Se
         **{role: list(names) for role, names in split.items()},
         "errors": [asdict(e) for e in errors],
     }
-
-
-__all__ = ["ALL", "HORIZONS_S", "MODEL_NAMES", "RealCarError", "as_json", "real_car_errors", "split_by_name"]

@@ -322,23 +322,3 @@ def scores_from_json(content: Mapping[str, Any]) -> list[RolloutScore]:
 def _one_step_nll(car: CarDynamics, rows: Transitions) -> float:
     inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
     return negative_log_likelihood(car.predict(inputs).smoothed(), outputs)
-
-
-__all__ = [
-    "ALL_ROWS",
-    "DISTURBED",
-    "INDEPENDENT",
-    "RolloutScore",
-    "Rows",
-    "as_json",
-    "checked_counts",
-    "energy_score",
-    "fit_all",
-    "fit_rows",
-    "fold_errors",
-    "folds",
-    "folds_of_rows",
-    "run_rollout_study",
-    "scores_from_json",
-    "scores_of",
-]

@@ -22,9 +22,9 @@ from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import whole_steps
 from sim_backends.array_ops import FLOATS
 from sim_backends.batch.rollout import rollout
-from sim_backends.car_parameters import LATENCY, SimulatorConfig
+from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, Effect
-from sim_backends.measurement import COMMAND_DELAY, MeasurementModel
+from sim_backends.measurement import COMMAND_DELAY, LATENCY, MeasurementModel
 from sim_backends.registry import REGISTRY
 
 HISTORY = 8
@@ -196,6 +196,3 @@ def _windows(episodes: Sequence[EpisodeData], history: int) -> tuple[Tensor, Ten
     chosen = torch.linspace(0, len(rows) - 1, min(len(rows), MAX_WINDOWS)).round().long().tolist()
     start, past, commands, end = (torch.stack(parts) for parts in zip(*(rows[k] for k in chosen), strict=True))
     return start, past, commands, end
-
-
-__all__ = ["HISTORY", "DrawnCars", "DrawnRollouts", "draw_cars", "select_cars"]

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from sim_backends.array_ops import Value
-from sim_backends.car_parameters import ModelKind
 from sim_backends.compiled.machine_code import (
     FloatRow,
     MachineCode,
@@ -29,6 +28,7 @@ from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.integrate import integrate_held
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.effects import EFFECTS, Effect
+from sim_backends.effects.base import ModelKind
 from sim_backends.measurement import MeasurementModel, filter_step
 from sim_backends.registry import REGISTRY
 

@@ -89,6 +89,3 @@ def _remove_older_half(folder: Path) -> None:
     if len(files) >= MAX_FILES:
         for path in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) // 2]:
             path.unlink(missing_ok=True)
-
-
-__all__ = ["MAX_FILES", "cache_folder", "cached_object_code"]

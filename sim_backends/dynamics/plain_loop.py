@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from sim_backends.car_parameters import GRAVITY_MPS2, CarParameters, SimulatorConfig
+from sim_backends.car_parameters import CarParameters, SimulatorConfig
 from sim_backends.dynamics.integrate import MAX_STEP_S, substeps_for
+from sim_backends.effects.base import GRAVITY_MPS2
 
 
 def derivative(state: FloatArray, steering: float, throttle: float, p: CarParameters) -> FloatArray:

@@ -15,9 +15,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from sim_backends.array_ops import Ops, Value
-from sim_backends.car_parameters import GRAVITY_MPS2, ModelKind
 from sim_backends.dynamics.effect_hooks import EffectHooks
-from sim_backends.effects.base import SLIP_FLOOR_MPS, Forces, StiffStep
+from sim_backends.effects.base import GRAVITY_MPS2, SLIP_FLOOR_MPS, Forces, ModelKind, StiffStep
 
 RELAXATION_S = 0.05
 """Time constant with which the kinematic car's side speed and yaw rate settle [s]."""

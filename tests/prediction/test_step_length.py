@@ -9,8 +9,8 @@ from carlab.prediction.step_length import MAX_STEP_S, MIN_STEP_S, fastest_rate, 
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.array_ops import FLOATS
-from sim_backends.car_parameters import GRAVITY_MPS2
 from sim_backends.dynamics.single_track import SingleTrack
+from sim_backends.effects.base import GRAVITY_MPS2
 from tests.helpers.recorded_drives import drive
 
 STIFF = SimulatorConfig.from_preset("dart_jetracer_linear").with_values(

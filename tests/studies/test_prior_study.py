@@ -25,13 +25,12 @@ from carlab.studies.priors import (
     NOMINAL,
     NONE,
     InDomain,
-    check_periods,
     prior_models,
     run_prior_study,
 )
 from carlab.studies.regression import methods as regression_methods
 from carlab.studies.regression import recordings as regression_recordings
-from carlab.studies.regression.recordings import DELAY_S, RecordedCase, recorded_case
+from carlab.studies.regression.recordings import DELAY_S, RecordedCase, check_periods, recorded_case
 from carlab.studies.regression.study import run_study
 from learning.baselines.ridge import Ridge
 from learning.outliers import tail_scales

@@ -10,8 +10,9 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
-from sim_backends.car_parameters import LATENCY, SimulatorConfig
+from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS
+from sim_backends.measurement import LATENCY
 from sim_backends.registry import REGISTRY
 
 BASE_PARAMETERS = (

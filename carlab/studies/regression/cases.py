@@ -356,5 +356,3 @@ CASES = {
         _RACECAR,
     )
 }
-
-__all__ = ["CASES", "TEST_ROWS", "Case", "Data"]

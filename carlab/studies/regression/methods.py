@@ -233,5 +233,3 @@ METHODS: dict[str, Callable[[FitTask], Model]] = {
 """Methods by their name in tables and on the command line; ``sim-posterior`` has no model discrepancy."""
 PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected")
 """The paper's algorithms; their inputs are in the world frame."""
-
-__all__ = ["METHODS", "PAPER_METHODS", "STEPS", "FitTask", "Model", "SmoothedParticles"]

@@ -141,6 +141,3 @@ def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) ->
         axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < MAX_RATIO_FINE_TICKS * low else (1.0,)))
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.minorticks_off()
-
-
-__all__ = ["draw", "picture"]

@@ -128,6 +128,3 @@ def check_periods(recordings: Sequence[Sequence[EpisodeData]], car: SimulatorCon
 
 def _without_spikes(rows: Transitions) -> Transitions:
     return rows.take(np.abs(rows.inputs[:, 2]) < MAX_YAW_RATE_RADPS)
-
-
-__all__ = ["DELAY_S", "MAX_YAW_RATE_RADPS", "NAME", "RecordedCase", "check_periods", "recorded_case"]

@@ -108,6 +108,3 @@ def scores_from_json(content: Mapping[str, Any]) -> list[Score]:
         {k: math.nan if v is None and k in FIGURES else v for k, v in row.items()} for row in content["scores"]
     ]
     return [Score(**row) for row in rows]
-
-
-__all__ = ["FIGURES", "Row", "Score", "as_json", "failed_score", "scores_from_json", "summarised"]

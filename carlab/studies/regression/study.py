@@ -193,6 +193,3 @@ def _nll_in_world(prediction: Prediction, data: Data) -> float | None:
         return seven_outputs(part, *start)
 
     return negative_log_likelihood(in_world(prediction), measured)
-
-
-__all__ = ["Fit", "Progress", "StudyPlan", "plan_study", "run_study", "scored"]
