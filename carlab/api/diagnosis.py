@@ -227,10 +227,10 @@ def _diagnosed(
     jobs: int | None,
     options: Mapping[str, Any],
 ) -> DiagnosisReport:
-    from carlab.diagnosis.diagnose import Inconclusive
     from carlab.diagnosis.diagnose import diagnose as search
     from carlab.diagnosis.evidence import Texts
     from carlab.diagnosis.findings import Diagnosis, FigureData
+    from carlab.diagnosis.recordings import Inconclusive
     from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.report.write import completed
     from sim_backends.effects import confusable_effects

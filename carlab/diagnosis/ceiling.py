@@ -19,6 +19,3 @@ def ceiling_of(refit_score: float, model_score: float, network_score: float) -> 
     model = min(model, excess)
     best = min(model, network)
     return Ceiling((excess - model) / excess, (model - best) / excess, best / excess)
-
-
-__all__ = ["ceiling_of"]

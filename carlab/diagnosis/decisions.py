@@ -77,6 +77,3 @@ def _condition(condition: Condition) -> dict[str, Any]:
         "threshold": float(condition.threshold),
         "above": condition.above,
     }
-
-
-__all__ = ["SCHEMA", "Alternatives", "Condition", "Decision", "to_dict"]

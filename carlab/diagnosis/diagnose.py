@@ -287,6 +287,3 @@ def _assemble_result(
 def _stated_parameters(nominal: SimulatorConfig) -> dict[str, float]:
     """Values of the car file by dotted name, without those that it states as unknown."""
     return {name: value for name, value in nominal.values().items() if name not in nominal.unknown}
-
-
-__all__ = ["Inconclusive", "Outcome", "Texts", "diagnose"]

@@ -241,14 +241,3 @@ def unexplained_share(scored: ScoredSearch, described: Fit | None = None) -> flo
     held_out = scored.held_out
     remaining = score["with_effects"] if described is None else held_out.score(held_out.final_error(described.config))
     return max(remaining**2 - 1.0, 0.0) / excess
-
-
-__all__ = [
-    "ScoredSearch",
-    "Texts",
-    "base_estimates",
-    "effect_findings",
-    "scores_by_step",
-    "unexplained_share",
-    "verdict_of",
-]

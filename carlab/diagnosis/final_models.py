@@ -157,14 +157,3 @@ def ceiling_by_networks(errors: Mapping[str, FitErrors]) -> Ceiling | None:
     if not networks:
         return None
     return ceiling_of(errors["refit"].score, errors[final_model_name(errors)].score, min(networks))
-
-
-__all__ = [
-    "Request",
-    "adapted",
-    "ceiling_by_networks",
-    "errors_with_events",
-    "fitted_score",
-    "measured_curves",
-    "trained_models",
-]

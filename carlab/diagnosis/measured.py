@@ -125,6 +125,3 @@ def curve_table(curve: CurveFinding) -> dict[str, Any]:
     plain["axes"] = [asdict(a) for a in curve.axes]
     plain["form"] = None if curve.form is None else asdict(curve.form)
     return plain | {name: getattr(curve, name).tolist() for name in arrays}
-
-
-__all__ = ["CurveAxis", "CurveFinding", "Estimate", "FormFinding", "curve_table"]

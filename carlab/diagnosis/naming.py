@@ -331,6 +331,3 @@ def _with_vibration(
         excess if first else made.fall,
         made.fit,
     )
-
-
-__all__ = ["NamingResult", "accept_names", "describe_unexplained", "residual_of"]

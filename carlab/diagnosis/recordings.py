@@ -187,6 +187,3 @@ def check_excitation(segments: Sequence[RecordingSegment], settings: WindowSetti
                 f"The {name} command is constant, so its influence cannot be identified; record a drive that varies "
                 f"it, for example carlab drive --policy {name}_steps."
             )
-
-
-__all__ = ["Inconclusive", "SplitRecordings", "check_excitation", "checked_held_out_share", "split_recordings"]

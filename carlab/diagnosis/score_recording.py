@@ -230,15 +230,3 @@ def describe_windows(score: PartScore) -> str:
     windows = score.held_out.windows
     first_s, last_s = float(np.min(windows.t0_s)), float(np.max(windows.t0_s)) + windows.horizon_s
     return f"{score.part} ({len(windows)} windows from {first_s:.1f} to {last_s:.1f} s)"
-
-
-__all__ = [
-    "ADAPTED",
-    "CONSTANT_VELOCITY",
-    "MODEL",
-    "NO_CHANGE",
-    "PartScore",
-    "RecordingScore",
-    "describe_windows",
-    "score_recording",
-]

@@ -76,6 +76,3 @@ class SearchTimer:
         """Whether the search was complete, what ended it, and the stages without a result."""
         limit_s = None if self.budget_s == math.inf else self.budget_s
         return SearchExtent(not self._stopped_by, self._stopped_by, limit_s, omitted=tuple(self._omitted))
-
-
-__all__ = ["SearchTimer"]

@@ -56,6 +56,3 @@ def _skill(
     steps = np.diff(windows.measured[rows][:, :, :2], axis=1)
     travelled_m = float(np.hypot(steps[..., 0], steps[..., 1]).sum(axis=1).mean())
     return Skill(int(recording) + 1, regime, int(rows.sum()), rms[0], rms[1], travelled_m, gain / error)
-
-
-__all__ = ["skill_of"]

@@ -80,6 +80,3 @@ def identity_distance(scored: ScoredSearch, effect: str) -> float:
         return 0.0
     precision = np.linalg.pinv(fit.covariance[np.ix_(own, own)])
     return float(np.sqrt(np.array(offsets) @ precision @ np.array(offsets)))
-
-
-__all__ = ["identity_distance", "without_uncertain_effects"]

@@ -101,6 +101,3 @@ def _with_standing_effects(
 def _margin(alternatives: Alternatives) -> float:
     """The best alternative's smallest excess of a statistic over its threshold; above 0 if the effect stands."""
     return max(min(c.statistic - c.threshold for c in conditions) for conditions in alternatives)
-
-
-__all__ = ["practical_size", "without_harmful_effects", "without_negligible_effects"]

@@ -138,6 +138,3 @@ def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:
     arrays = (windows.initial_states[:, 3:], past_commands(windows, history), windows.commands, motion)
     velocities, past, commands, motions = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in arrays)
     return DriveWindows(velocities, past, commands, motions, windows.period_s)
-
-
-__all__ = ["N_SAMPLES", "LearnedModel", "drive_windows", "past_commands", "recorded_windows", "sample_paths"]

@@ -351,6 +351,3 @@ def _in_world(path: FloatArray, windows: PredictionWindows) -> FloatArray:
     out[..., 1] = y + sin * path[..., 0] + cos * path[..., 1]
     out[..., 2] = yaw + path[..., 2]
     return out
-
-
-__all__ = ["EnsembleSettings", "NetworkEnsemble", "check_duration", "train_ensemble"]

@@ -85,6 +85,3 @@ def rerun_file(
         file.close()
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-
-
-__all__ = ["replaced_file", "rerun_file", "write_text"]

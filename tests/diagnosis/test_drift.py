@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlab.diagnosis.diagnose import Texts, diagnose
+from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.drift import adapt_to_held_out
+from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.drift import drift_sentence

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from carlab.core.episode_data import EpisodeData
-from carlab.diagnosis.diagnose import Inconclusive, diagnose
+from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import DataFault
-from carlab.diagnosis.recordings import split_recordings
+from carlab.diagnosis.recordings import Inconclusive, split_recordings
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends import SimulatorConfig

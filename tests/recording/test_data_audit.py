@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from carlab.core.angles import wrap
-from carlab.recording.audit.audit import Severity
+from carlab.recording.audit.report import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from carlab.core.errors import ConfigError, DataError
-from carlab.recording.audit.audit import Severity
+from carlab.recording.audit.report import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
 from carlab.recording.csv.foreign import import_csv
 

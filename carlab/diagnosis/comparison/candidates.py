@@ -96,6 +96,3 @@ def size_of(candidate: ChangeCandidate, z: FloatArray, z0: FloatArray) -> FloatA
         f.origin * (math.exp(f.size * a) - math.exp(f.size * b)) if f.logarithmic else f.size * (a - b)
         for f, a, b in zip(candidate.free, z, z0, strict=True)
     ])  # fmt: skip
-
-
-__all__ = ["CandidatePoints", "ChangeCandidate", "candidate_points", "change_candidates", "size_of", "with_candidate"]

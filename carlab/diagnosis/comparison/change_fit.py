@@ -114,6 +114,3 @@ def _jacobian(
     ahead, behind = _within(free, z + step), _within(free, z - step)
     width = np.diag(ahead - behind)
     return np.asarray((errors_at(ahead) - errors_at(behind)) / np.where(width > 0.0, width, 1.0)[:, None, None])
-
-
-__all__ = ["ChangeFit", "fit_change"]

@@ -235,6 +235,3 @@ def _change(
         at.candidate.id, parameters, reference, p, one.fit.loss_share,
         standard_errors, ties,
     )  # fmt: skip
-
-
-__all__ = ["Comparison", "compare"]

@@ -148,6 +148,3 @@ def _without(secant: FloatArray, known: Sequence[FloatArray], weight: FloatArray
     basis, _ = np.linalg.qr(np.stack([(root * k).ravel() for k in known], axis=1))
     own = (root * secant).ravel()
     return np.asarray((own - basis @ (basis.T @ own)).reshape(secant.shape) / root)
-
-
-__all__ = ["Difference", "GroupErrors", "difference", "p_value"]

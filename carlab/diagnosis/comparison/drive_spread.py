@@ -118,14 +118,3 @@ def _inverse_trigamma(value: float) -> float:
     if value <= polygamma(1, largest):
         return largest
     return float(brentq(lambda x: float(polygamma(1, x)) - value, 1e-6, largest))
-
-
-__all__ = [
-    "DriveSpread",
-    "SpreadPrior",
-    "longest_drive_blocks",
-    "part_blocks",
-    "parts_of",
-    "spread_of_parts",
-    "spread_prior",
-]

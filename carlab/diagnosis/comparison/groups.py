@@ -132,6 +132,3 @@ def _windows(segments: Sequence[RecordingSegment], settings: DiagnosisSettings) 
     if len(np.unique(cut.block)) < settings.comparison.min_blocks:
         raise Inconclusive("The car moves too little in one group; record at least one minute of driving.")
     return cut.thinned(settings.windows.max_fit_windows)
-
-
-__all__ = ["ComparedGroups", "compared_groups"]

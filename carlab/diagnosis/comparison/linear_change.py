@@ -173,6 +173,3 @@ def _subset(group: GroupErrors, rows: NDArray[np.bool_]) -> GroupErrors:
 def short_name(name: str) -> str:
     """Name of an effect's parameter without the effect; a base parameter keeps its dotted name."""
     return name.rpartition(".")[2] if name.startswith("effects.") else name
-
-
-__all__ = ["LinearChange", "Secants", "linear_changes", "null_p_values", "short_name"]

@@ -110,6 +110,3 @@ def _product(factors: Sequence[float]) -> float:
     for factor in factors:
         made *= factor
     return made
-
-
-__all__ = ["SCHEMA", "Change", "Comparison", "ComparisonVerdict", "Tested", "verdict_sentence"]

@@ -136,6 +136,3 @@ def _scale(problem: SearchProblem, config: SimulatorConfig) -> Scale:
 
 def _coordinates(fit: Fit) -> dict[str, float]:
     return {f.name: float(z) for f, z in zip(fit.free, fit.z, strict=True)}
-
-
-__all__ = ["CurveFit", "fit_curves"]

@@ -72,6 +72,3 @@ def _is_free(problem: SearchProblem) -> bool:
     """Whether the base model has the curve and its offset, and the curve is not in the car file."""
     added = SteeringOffset.id, SteeringCurve.id
     return SteeringCurve.id not in problem.nominal.effects and all(is_applicable(problem.nominal, e) for e in added)
-
-
-__all__ = ["curve_in_addition", "replacing_curve"]

@@ -189,6 +189,3 @@ def _projection(x: FloatArray, knots: Sequence[float]) -> FloatArray:
     hats = np.stack([np.broadcast_to(w, x.shape) for w in weights(ARRAYS, x, knots)], axis=1)
     spacing = np.gradient(x)
     return np.asarray(np.linalg.solve(hats.T * spacing @ hats, hats.T * spacing))
-
-
-__all__ = ["identify_form"]

@@ -61,6 +61,3 @@ def simulator_with_curves(
     if measured is None:
         return found.best.config
     return without_extrapolation(measured, recordings.fit_segments, settings.curves).fit.config
-
-
-__all__ = ["EFFECTS_WITH_CURVES", "simulator_with_curves"]

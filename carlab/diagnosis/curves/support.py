@@ -123,6 +123,3 @@ def _covariance(found: CurveFit, curve: MeasuredCurve, grid: Sequence[FloatArray
     moved = [_curve(found, curve, z + step * unit, grid) for unit in np.eye(len(z))]
     jacobian = np.stack([(m - at_z) / step for m in moved]).reshape(len(z), -1)
     return np.asarray(jacobian.T @ found.fit.covariance @ jacobian)
-
-
-__all__ = ["curve_findings", "driving_time_s", "recorded_forces", "without_extrapolation"]

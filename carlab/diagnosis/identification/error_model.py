@@ -119,6 +119,3 @@ class CrossFittedErrors:
 
 def _distance_sq(errors: FloatArray, scatter: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("si,ij,sj->s", errors, np.linalg.inv(scatter), errors))
-
-
-__all__ = ["CrossFittedErrors", "ErrorModel"]

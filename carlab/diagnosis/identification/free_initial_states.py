@@ -96,6 +96,3 @@ def linearised_by_initial_states(
         error = prediction_errors(predicted.reshape(7, count, -1, 6), windows)[:, :, 1:]
         white = bounded(error / measured_std).reshape(7, count, -1)
     return white[0], np.moveaxis(white[1:] - white[0], 0, -1)
-
-
-__all__ = ["initial_state_correction", "linearised_by_initial_states", "loss_of_free_initial_states"]

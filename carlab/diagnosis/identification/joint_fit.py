@@ -225,6 +225,3 @@ class _Problem:
         by_states, by_parameters = changes[..., :6] / _STATE_STEP, changes[..., 6:] / steps
         shift, error, weights = initial_state_correction(white[0], by_states, self.fitter.settings.huber_delta)
         return _Linearisation(error, by_states, by_parameters, shift * self.std, weights)
-
-
-__all__ = ["joint_fit"]

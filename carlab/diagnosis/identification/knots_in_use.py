@@ -80,6 +80,3 @@ def knots_in_use(
     with ignored, report_evaluations(mark):
         simulate_windows(windows, config, values, max_step_s=step_s, engine="operators")
     return used
-
-
-__all__ = ["influencing_parameters", "knots_in_use"]

@@ -270,6 +270,3 @@ def _reported_values(
 
 def _change(value: float, before: float) -> float:
     return abs(math.log(value / before)) if value > 0.0 and before > 0.0 else abs(value - before)
-
-
-__all__ = ["ALL_PARAMETERS", "Cause", "FittedParameterValue", "find_causes", "scale_of"]

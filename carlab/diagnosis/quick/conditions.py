@@ -95,6 +95,3 @@ def _places(windows: PredictionWindows, settings: QuickSettings) -> Iterator[tup
     for x, y in cells:
         near = (np.hypot(paths[..., 0] - x, paths[..., 1] - y) < settings.place_radius_m).any(axis=1)
         yield "place", f"within {settings.place_radius_m:.1f} m of ({x:.1f}, {y:.1f})", near
-
-
-__all__ = ["ErrorCondition", "find_conditions"]

@@ -217,6 +217,3 @@ def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelScore, ...]:
         ChannelScore(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), STATE_UNITS[k])
         for k in np.argsort(-rms)
     )
-
-
-__all__ = ["SCHEMA", "ChannelScore", "CheckVerdict", "QuickCheck", "held_out_loss", "quick_check"]

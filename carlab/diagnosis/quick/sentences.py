@@ -75,6 +75,3 @@ def _cause(cause: Cause) -> str:
         values.append(text)
     refit = " with other parameters of the car file" if cause.with_refit else ""
     return f"{name} ({', '.join(values)}){refit}"
-
-
-__all__ = ["sentences", "short"]

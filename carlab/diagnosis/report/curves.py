@@ -211,6 +211,3 @@ def _chart(curve: CurveFinding, row: tuple[int, ...], span: tuple[float, float],
     half = 0.5 * np.min(np.diff(x))
     chart.spans([(v - half, v + half) for v in without], "bound")
     return Figure(chart.render(), "")
-
-
-__all__ = ["ceiling_sentence", "curve_charts", "curve_sentences", "curves_advice", "readings_of_drive"]

@@ -134,6 +134,3 @@ def _trace(
     return Trace(
         f"recording {segment.recording + 1}", segment.t_s, segment.states, predicted, tuple(sorted(worst)), own
     )
-
-
-__all__ = ["figure_data_of"]

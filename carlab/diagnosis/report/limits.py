@@ -31,6 +31,3 @@ def excluded_sizes(diagnosis: Diagnosis) -> str:
 def _largest(estimate: Estimate) -> float:
     """Largest size within the 90 % interval."""
     return max(abs(estimate.low90), abs(estimate.high90))
-
-
-__all__ = ["excluded_sizes"]

@@ -37,6 +37,3 @@ def parameters_at_limit(diagnosis: Diagnosis) -> str:
         return ""
     ends = "ends" if len(names) == 1 else "end"
     return f" {listed(names)} {ends} at the limit of the range in the car file; widen it and diagnose again."
-
-
-__all__ = ["parameters_at_limit", "wrong_parameters"]

@@ -50,13 +50,3 @@ def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
     if diagnosis.verdict in ("none", "parameters") and not is_above_noise(diagnosis, "refit"):
         return None
     return rest
-
-
-__all__ = [
-    "differs_when_held_out",
-    "explained_share",
-    "is_above_noise",
-    "relevant_residual",
-    "remaining_share",
-    "shown_errors",
-]

@@ -24,6 +24,3 @@ def search_sentences(search: SearchExtent) -> str:
     if search.omitted:
         text += f" The user ended the diagnosis, so this report has no {listed(search.omitted, 'and no')}."
     return text
-
-
-__all__ = ["search_sentences"]

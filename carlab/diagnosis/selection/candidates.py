@@ -142,6 +142,3 @@ def _log(problem: SearchProblem, model: Model, c: Candidate) -> None:
         len(model.effects), c.effect, c.gain, c.chi2, problem.required_chi2(c.effect), c.left_out_gain,
         c.standard_errors, c.left_out_gain / problem.perfect_loss(), numbers,
     )  # fmt: skip
-
-
-__all__ = ["accepted", "is_accepted", "next_candidates"]

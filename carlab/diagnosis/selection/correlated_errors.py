@@ -52,6 +52,3 @@ def decorrelating(problem: SearchProblem, model: Model) -> Scale:
     errors = white.reshape(len(white), -1).clip(-limit, limit)
     root = ErrorModel.of(errors, problem.settings.selection.error_ridge_share, problem.settings.comparison).root
     return replace(model.scale, root=root)
-
-
-__all__ = ["decorrelating", "without_unsupported_effects"]

@@ -40,6 +40,3 @@ def confusable_shared_delays(model: Model) -> list[tuple[str, str]]:
     """
     shared = (name for name, effect in EFFECTS.items() if effect.split_into)
     return [(found[0], name) for name in shared if (found := effect_of_each_command(model, name))]
-
-
-__all__ = ["confusable_shared_delays", "effect_of_each_command", "group_lags_s", "lag_s"]

@@ -61,6 +61,3 @@ def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> Elim
         model = Model(tuple(e for e in model.effects if e != weakest), deletions[weakest].without, model.scale)
         deletions = delete_each(problem, model, control)
     return EliminationResult(model, deletions)
-
-
-__all__ = ["Deletion", "EliminationResult", "delete_each", "eliminate"]

@@ -130,6 +130,3 @@ def _is_better(problem: SearchProblem, model: Model, reference: Model) -> bool:
     gain, error = clustered_gain(reference_loss, loss, problem.windows)
     log.info("gain on left-out blocks of the alternative: %.1f (%.1f standard errors)", gain, gain / error)
     return gain > settings.tie_z * error
-
-
-__all__ = ["Choice", "Path", "best_path", "extend", "remaining_excess"]

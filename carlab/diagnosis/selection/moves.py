@@ -67,6 +67,3 @@ def _fitted_swap(
     candidate = refit_candidate(problem, reduced, screened)
     design_effect = design_effect_of(problem.fitter(model.scale).with_covariance(candidate.fit), other)
     return candidate, 2.0 * (model.fit.cost - candidate.fit.cost) / design_effect
-
-
-__all__ = ["apply_moves"]

@@ -135,6 +135,3 @@ def left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
         max_error=problem.settings.selection.max_left_out_error,
         settings=problem.settings.identification,
     )
-
-
-__all__ = ["PairwiseResult", "choose_confusable", "compare_pairs", "left_out_loss"]

@@ -201,6 +201,3 @@ def is_applicable(config: SimulatorConfig, effect: str) -> bool:
     """Whether the effect can be identified with this base model and its free parameters."""
     of_unknown = any(p.same_as in config.unknown for p in EFFECTS[effect].parameters)
     return config.kind in EFFECTS[effect].base_models and not of_unknown
-
-
-__all__ = ["Candidate", "Model", "RunControl", "SearchProblem", "SearchResult", "is_applicable"]

@@ -117,6 +117,3 @@ def fit_base(problem: SearchProblem) -> Model:
     """Fit the base parameters alone."""
     free = problem.free_parameters(())
     return fit_with_scale(problem, (), problem.nominal, free, problem.nominal_coordinates(free))
-
-
-__all__ = ["fit_base", "fit_with_scale", "refit", "refit_candidate", "refit_without_each"]

@@ -90,6 +90,3 @@ def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float, contr
     chosen = screened[: problem.settings.rivals.max_refits]
     fitted = control.workers.map(refit_candidate, [(problem.without_refits(), model, result) for result in chosen])
     return [candidate for candidate in fitted if candidate is not None]
-
-
-__all__ = ["RivalPhysics", "additional_physics", "replacing_physics"]

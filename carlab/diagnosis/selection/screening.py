@@ -238,6 +238,3 @@ def screen_candidates(
     screen = Screen(fitter, problem.config_with(model.effects), model.fit, settings.max_windows, settings)
     scored = control.workers.map(screen.score, [(name, effect_parameters(name, problem.nominal)) for name in names])
     return tuple(sorted((each for each in scored if each is not None), key=lambda result: -result.score))
-
-
-__all__ = ["Screen", "ScreeningResult", "screen_candidates", "size_of_change"]

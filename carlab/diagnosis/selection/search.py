@@ -64,6 +64,3 @@ def restrict(problem: SearchProblem, found: SearchResult, names: tuple[str, ...]
         indistinguishable=pairs.indistinguishable,
         history=history,
     )
-
-
-__all__ = ["restrict", "search"]

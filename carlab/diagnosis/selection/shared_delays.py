@@ -150,6 +150,3 @@ def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings
     if len(replacement.new) == len(replacement.old):
         return (Condition("selection.replace_z_min", z, settings.replace_z_min),)
     return (Condition("selection.keep_z_min", -z, settings.keep_z_min, above=False),)
-
-
-__all__ = ["replace_shared_delays"]

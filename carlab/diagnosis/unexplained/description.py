@@ -246,14 +246,3 @@ def worst_regime(
         if ratio > max(best, settings.regime_ratio_min):
             best, text = ratio, f"{name} > {limit:.2g} {unit}".strip()
     return text
-
-
-__all__ = [
-    "REGIMES",
-    "ChosenTerm",
-    "ResidualModel",
-    "describe",
-    "fit_residual_terms",
-    "start_features",
-    "worst_regime",
-]

@@ -239,6 +239,3 @@ def features(windows: PredictionWindows, predicted: FloatArray, config: Simulato
         "t": (windows.t0_s[:, None] + at * period_s) / max(float(windows.t0_s.max()), 1.0),
         "work": np.tile(work[:, None], (1, len(at))),
     }
-
-
-__all__ = ["TERMS", "Responses", "Term", "features", "responses"]

@@ -384,16 +384,3 @@ def _checked_value(content: Mapping[str, Any], name: str, kind: type[T]) -> T:
     if type(value) is not kind or (kind is int and value < 1):
         raise ValueError(f"{name} is {value!r}")
     return value
-
-
-__all__ = [
-    "CAMPAIGN_FILE",
-    "Campaign",
-    "CampaignHooks",
-    "check_period",
-    "check_same_car",
-    "prior_simulator",
-    "resumed_campaign",
-    "saved_plan",
-    "saved_seed",
-]

@@ -154,6 +154,3 @@ def _call(
         pipe.send(("crashed", f"{type(error).__name__}: {error}"))
     finally:
         pipe.close()
-
-
-__all__ = ["ChildError", "child_context", "interrupts_blocked", "run_in_child"]

@@ -249,6 +249,3 @@ def predict_ahead(
     left = np.stack([-np.sin(mean[..., 2]), np.cos(mean[..., 2])], axis=-1)
     across = ((paths[..., :2] - mean[:, None, :, :2]) * left[:, None]).sum(axis=-1)
     return PathsAhead(mean, across.std(axis=1))
-
-
-__all__ = ["EpisodeFigures", "PathsAhead", "WindowPredictions", "figures_of", "predict_ahead", "predict_windows"]

@@ -56,6 +56,3 @@ def _check_types(figures: Mapping[str, Any]) -> None:
     for name in _TEXTS:
         if not isinstance(figures.get(name, ""), str):
             raise ValueError(f"{name} is {figures[name]!r}, not a text")
-
-
-__all__ = ["FIGURES_FILE", "read_training_figures"]

@@ -57,6 +57,3 @@ def load_policy(folder: Path) -> LearnedPolicy:
             f"{feature_size(plan.history)}; remove the folder to train again."
         )
     return LearnedPolicy(agent.policy(), plan, int(folders[-1].name), history)
-
-
-__all__ = ["LearnedPolicy", "load_policy"]

@@ -209,6 +209,3 @@ class _LiveWriter:
         if self._driver is not None and row.episode <= len(recordings):
             add_windows(self._recording, self._driver.dynamics, row.episode, recordings[row.episode - 1])
         self._recording.add_figures(row.episode, row.to_dict())
-
-
-__all__ = ["LiveSettings", "LiveView", "show"]

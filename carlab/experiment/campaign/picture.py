@@ -160,6 +160,3 @@ def _state(axis: Any, which: int, episode: EpisodeData, predictions: WindowPredi
     axis.set_xlabel("t [s]", fontsize=8)
     axis.tick_params(labelsize=7)
     axis.grid(alpha=0.3)
-
-
-__all__ = ["draw"]

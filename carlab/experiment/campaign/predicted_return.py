@@ -96,6 +96,3 @@ def _sufficient_ticks(plan: TrainingPlan, agent: SacAgent, learned: ModelEnv) ->
         if float(plan.task.success(ends).float().mean()) >= MIN_SUCCESS_SHARE:
             return {} if length == ticks else {"needed_ticks": length}
     return {}
-
-
-__all__ = ["predicted_figures"]

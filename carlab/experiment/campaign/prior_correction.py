@@ -261,15 +261,3 @@ def _ids(corrections: Sequence[Correction]) -> set[str]:
 
 def _listed(corrections: Sequence[Correction]) -> str:
     return ", ".join(c.id for c in corrections)
-
-
-__all__ = [
-    "PARAMETERS",
-    "Correction",
-    "Findings",
-    "PriorVersion",
-    "corrected",
-    "needed_history",
-    "next_version",
-    "without_ranges",
-]

@@ -146,8 +146,9 @@ def contradicted_by(
 
 def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorConfig, budget_s: float) -> Findings:
     """The findings with a diagnosis of all episodes, of which every third is held out."""
-    from carlab.diagnosis.diagnose import Inconclusive, diagnose
+    from carlab.diagnosis.diagnose import diagnose
     from carlab.diagnosis.evidence import Texts
+    from carlab.diagnosis.recordings import Inconclusive
     from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.state_alignment import align_states
     from sim_backends.effects import confusable_effects
@@ -201,17 +202,3 @@ def _valid(std: dict[str, float], values: dict[str, float]) -> dict[str, float]:
 def _failed(request: CorrectionRequest, reason: str) -> PriorVersion:
     text = f"The correction of the prior after episode {len(request.recordings)} failed ({reason.rstrip('.')})"
     return replace(request.before, sentence=f"{text}; the prior is unchanged.")
-
-
-__all__ = [
-    "CORRECTION_FILE",
-    "DIAGNOSIS_BUDGET_S",
-    "CorrectionRequest",
-    "contradicted_by",
-    "correct_prior",
-    "correction_path",
-    "corrections_of",
-    "diagnosed",
-    "read_version",
-    "run_correction_subprocess",
-]

@@ -124,6 +124,3 @@ def _saved(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
     except OSError as error:
         log.warning("%s cannot be written: %s", path, error)
     return content
-
-
-__all__ = ["CHECK_FILE", "SIMULATOR_FILE", "EpisodeCheck", "check", "check_path", "next_step", "run_check_subprocess"]

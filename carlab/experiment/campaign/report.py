@@ -70,14 +70,3 @@ def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> 
     newest = write_run_recording(run, {r.episode: r for r in rows}, run.path / "learn.rrd")
     if newest is not None:
         draw(rows, newest.number, newest.data, newest.windows, plan.task, run.path / PICTURE_FILE)
-
-
-__all__ = [
-    "CURVE_FILE",
-    "PICTURE_FILE",
-    "learning_curve",
-    "restore_missing_rows",
-    "save_check",
-    "save_row",
-    "write_report",
-]

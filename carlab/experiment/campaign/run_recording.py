@@ -135,6 +135,3 @@ def add_windows(recording: RunRecording, dynamics: LearnedCar, number: int, file
     windows = predict_windows(dynamics, data)
     recording.add_windows(data, windows.ticks, windows.mean, windows.std)
     return PredictedEpisode(number, data, windows)
-
-
-__all__ = ["LearnedDriver", "PredictedEpisode", "add_windows", "readable_episodes", "write_run_recording"]

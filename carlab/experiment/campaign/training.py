@@ -386,13 +386,3 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
     except OSError as error:
         shutil.rmtree(unfinished, ignore_errors=True)  # unfinished files would keep the disk full
         raise DataError(describe_os_error(error, folder)) from error
-
-
-__all__ = [
-    "DYNAMICS_FILE",
-    "FIGURES_FILE",
-    "model_folder",
-    "recorded_features",
-    "train",
-    "training_figures",
-]

@@ -110,6 +110,3 @@ def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
         if type(value) is not int or not minimum <= value <= MAX_VALUES.get(name, value):
             raise ValueError(f"{name} of the plan is {value!r}")
     return plan
-
-
-__all__ = ["TrainingPlan", "method_of", "plan_as_json", "plan_from_json"]

@@ -76,6 +76,3 @@ def train_in_subprocess(
         for unfinished in models.glob("*.partial"):
             shutil.rmtree(unfinished, ignore_errors=True)
     return figures
-
-
-__all__ = ["Trainer", "TrainingDiedError", "train_in_subprocess"]

@@ -126,6 +126,3 @@ class LinkProcess:
             if stream is not None:
                 with contextlib.suppress(BrokenPipeError):
                     stream.close()
-
-
-__all__ = ["Link", "LinkProcess"]

@@ -58,6 +58,3 @@ class LinkRequest:
         """Read a line. Raises ValueError, KeyError or TypeError for another one."""
         content: dict[str, Any] = json.loads(line)
         return cls(str(content["order"]), str(content["to"]))
-
-
-__all__ = ["LinkEvent", "LinkRequest"]

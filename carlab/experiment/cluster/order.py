@@ -161,6 +161,3 @@ def _envelope(table: Mapping[str, Any]) -> SafetyEnvelope:
     arena = tuple((float(x), float(y)) for x, y in table["arena_m"])
     limits: dict[str, Any] = {name: float(value) for name, value in table.items() if name != "arena_m"}
     return replace(SafetyEnvelope(**limits), arena_m=arena)
-
-
-__all__ = ["RESULT_FILES", "TrainingOrder", "check_task"]

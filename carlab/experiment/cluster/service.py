@@ -157,6 +157,3 @@ class TrainingService:
             except Exception as error:
                 log.exception("Training failed")
                 training.message, training.state = f"{type(error).__name__}: {error}", "lost"
-
-
-__all__ = ["TrainingService", "sha256"]

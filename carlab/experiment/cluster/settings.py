@@ -37,6 +37,3 @@ class LinkSettings:
     poll_s: float = 0.5
     max_lost_workers: int = 3
     idle_s: float = 900.0
-
-
-__all__ = ["LinkSettings"]

@@ -244,6 +244,3 @@ def _plan_here(plan: TrainingPlan) -> TrainingPlan:
     except ConfigError:
         return replace(plan, device="cpu")
     return plan
-
-
-__all__ = ["ClusterTrainer"]

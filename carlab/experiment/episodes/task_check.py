@@ -243,6 +243,3 @@ def _check_summary(task: Task, starts: FloatArray) -> None:
     text = _call(task, "outcome", task.outcome, summary)
     if not isinstance(text, str):
         raise _error(task, f"outcome returns {text!r}; return a text")
-
-
-__all__ = ["check_task"]

@@ -13,7 +13,7 @@ import numpy as np
 from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit import file_checks
-from carlab.recording.audit.report import AuditReport, Finding, Severity
+from carlab.recording.audit.report import Finding, Severity
 from carlab.recording.column_mapping import COMMAND_CHANNELS, VELOCITY_CHANNELS, ColumnMapping, ColumnSource
 from carlab.recording.faults.commands import (
     MIN_ROWS,
@@ -39,8 +39,6 @@ from carlab.recording.faults.velocity import (
     wrong_velocity_frame,
 )
 from carlab.recording.pose_velocity import BoolArray, PoseMotion
-
-__all__ = ["AuditReport", "Channels", "Finding", "Severity", "audit_channels"]
 
 MIN_MOVING_ROWS, MIN_TURNING_ROWS = 50, 30
 MIN_COMMAND_RANGE = 0.05

@@ -113,6 +113,3 @@ class DocumentStream:
         self.columns.set_time(self.now_s, self._step)
         self.stream.log(path, entity)
         self.logged.add(path)
-
-
-__all__ = ["DocumentStream"]

@@ -259,6 +259,3 @@ def _cell(value: Value) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.2f}" if isinstance(value, float) else str(value).replace("_", " ").lower()
-
-
-__all__ = ["PAUSE_S", "RunRecording", "episode_number"]

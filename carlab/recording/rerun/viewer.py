@@ -103,15 +103,3 @@ def check_viewer(address: str) -> None:
 def connect_to_viewer(stream: rr.RecordingStream, address: str) -> None:
     """Connect a stream to an open viewer."""
     stream.connect_grpc(address)
-
-
-__all__ = [
-    "ADDRESS",
-    "check_rerun_file",
-    "check_viewer",
-    "connect_to_viewer",
-    "free_port",
-    "open_viewer",
-    "rerun_program",
-    "wait_until_open",
-]
