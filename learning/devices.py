@@ -110,14 +110,3 @@ class CapturedFunction:
         with torch.cuda.graph(graph):
             self._outputs = self._function(*self._inputs)
         self._graph = graph
-
-
-__all__ = [
-    "CapturedFunction",
-    "DeviceName",
-    "available",
-    "can_capture",
-    "denormals_flushed",
-    "device_name",
-    "synchronise",
-]

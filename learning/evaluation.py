@@ -199,14 +199,3 @@ def calibration_error(prediction: Prediction, targets: Tensor) -> float:
     levels = torch.tensor(LEVELS, dtype=central.dtype, device=central.device)
     covered = (central[None] <= levels[:, None, None]).to(central.dtype).mean(dim=1)
     return float((covered - levels[:, None]).abs().mean())
-
-
-__all__ = [
-    "LEVELS",
-    "Mixture",
-    "Prediction",
-    "WeightedMixture",
-    "calibration_error",
-    "negative_log_likelihood",
-    "root_mean_square_error",
-]

@@ -209,17 +209,3 @@ def log_student(square: Tensor, outputs: int, dof: float) -> Tensor:
     constant = math.lgamma(0.5 * (dof + outputs)) - math.lgamma(0.5 * dof)
     constant -= 0.5 * outputs * math.log(dof * math.pi)
     return constant - 0.5 * (dof + outputs) * torch.log1p(square / dof)
-
-
-__all__ = [
-    "decorrelation_of",
-    "initial_row_weights",
-    "leave_one_out",
-    "leave_one_out_log_density",
-    "log_student",
-    "mahalanobis_sq",
-    "median_scale",
-    "output_correlation",
-    "student_weights",
-    "tail_scales",
-]

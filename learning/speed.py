@@ -195,6 +195,3 @@ def _seconds(work: Any, device: str, times: int = 50) -> float:
         synchronise(device)
         taken.append(clock.now_s() - began_s)
     return float(np.median(taken))
-
-
-__all__ = ["prediction_speed", "sac_speed", "training_speed"]

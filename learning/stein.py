@@ -112,6 +112,3 @@ def moment_direction(values: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
     white_direction = (white - white @ gram / count) / width - white.mean(dim=2, keepdim=True)
     direction: Tensor = (factor @ white_direction).permute(2, 0, 1)
     return direction
-
-
-__all__ = ["RbfKernel", "median_bandwidth", "moment_direction", "natural_direction", "stein_direction"]

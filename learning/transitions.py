@@ -164,6 +164,3 @@ def velocity_delay_s(rows: Transitions, period_s: float) -> float:
         mask = error <= np.quantile(error, TRIMMED_QUANTILE, axis=0)
     delay_s = float(np.clip(weight[square > 0.0].mean() - 0.5, 0.0, 1.0)) * period_s if square.any() else 0.0
     return delay_s if delay_s > MIN_DELAY_S else 0.0
-
-
-__all__ = ["OUTPUTS", "Transitions", "has_whole_step", "transitions_of", "velocity_delay_s"]

@@ -290,6 +290,3 @@ def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBody
     else:
         remedy = f"set body in [hardware.mocap] (listen: --body) to one of {available}."
     raise NotReadyError("No motion capture", [f"the server has no rigid body {wanted}; {remedy}"])
-
-
-__all__ = ["MocapConfig", "RigidBodyPoseSource", "select_body"]

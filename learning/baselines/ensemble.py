@@ -144,6 +144,3 @@ def _noise(errors: Tensor, known_variance: Tensor) -> tuple[float, Tensor]:
     total = variance + known_variance
     log_likelihood = -0.5 * (total.log() + (errors**2 / total).clamp_max(9.0) + math.log(2.0 * math.pi)).sum()
     return float(log_likelihood), variance.sqrt()
-
-
-__all__ = ["Ensemble", "deep_ensemble"]

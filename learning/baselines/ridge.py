@@ -65,6 +65,3 @@ class Ridge:
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Mean (n, O) at inputs (n, D)."""
         return np.asarray((inputs - self.mean) / self.scale @ self.weights[:-1] + self.weights[-1])
-
-
-__all__ = ["Ridge"]

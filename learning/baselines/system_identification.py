@@ -196,6 +196,3 @@ def _best(losses: Losses, starts: Tensor, ends: Tensor) -> Tensor:
     if not torch.isfinite(values).any():
         raise DataError("The simulator gives no finite outputs for this data; check the car file and the rows.")
     return offsets[values.argmin()]
-
-
-__all__ = ["GreyBox", "IdentifiedSimulator", "identify"]

@@ -218,6 +218,3 @@ def _domain_points(history: int, generator: torch.Generator) -> Tensor:
 
 def _inputs(now: Tensor, features: Tensor, action: Tensor) -> Tensor:
     return torch.cat([now, features[:, STATE_FEATURES:], action], dim=1)
-
-
-__all__ = ["WorldDynamics", "authors_settings", "fit_authors_fsvgd", "in_world", "simulated_changes", "world_rows"]

@@ -335,13 +335,3 @@ def _add_likelihood(
         square = (residual * residual).mean(dim=0).sum(dim=0) / noise**2
         prior = settings.noise_rows * (1.0 - (optimiser.prior_noise / noise) ** 2)
         optimiser.log_noise.grad = weight * (rows_used - square) + prior
-
-
-__all__ = [
-    "FsvgdSettings",
-    "FunctionPrior",
-    "GaussianProcessPrior",
-    "SimulatorPrior",
-    "check_rows",
-    "fit_fsvgd",
-]

@@ -63,6 +63,3 @@ class Adam:
         self.mean.copy_(mean)
         self.square.copy_(square)
         self._steps.fill_(float(state["steps"]))
-
-
-__all__ = ["Adam"]

@@ -85,6 +85,3 @@ def whole_number(arrays: Mapping[str, NDArray[np.generic]], name: str) -> int:
     if array is None or array.shape != () or array.dtype.kind not in "iu" or int(array) < 0:
         raise DataError(f"{name} is not a non-negative integer")
     return int(array)
-
-
-__all__ = ["MAX_BYTES", "TOO_LARGE", "check_archive", "checked_tensor", "read_arrays", "whole_number", "write_arrays"]

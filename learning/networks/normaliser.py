@@ -66,6 +66,3 @@ class Normaliser:
         parts = (self.input_mean, self.input_std, self.output_mean, self.output_std)
         moved = Normaliser(*(part.to(device) for part in parts))
         return moved if self.decorrelation is None else moved.decorrelated(self.decorrelation.to(device))
-
-
-__all__ = ["Normaliser"]

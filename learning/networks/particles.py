@@ -194,6 +194,3 @@ def _weight_gradient(inputs: Tensor, direction: Tensor) -> Tensor:
     if direction.shape[2] == 1:
         return torch.bmm(direction.transpose(1, 2), inputs).flatten(1)
     return torch.bmm(inputs.transpose(1, 2), direction).flatten(1)
-
-
-__all__ = ["Activation", "Layers", "Network", "Pullback"]

@@ -245,6 +245,3 @@ def _stacked(networks: Iterable[list[list[nn.Linear]]]) -> _StackedNetworks:
                     parameter.data = view
                 begin = columns.stop
     return _StackedNetworks(shape, flat)
-
-
-__all__ = ["FastSac"]

@@ -296,6 +296,3 @@ class _Milestones(BaseCallback):
 
     def _on_step(self) -> bool:
         return bool(self._milestones)
-
-
-__all__ = ["SacAgent", "SacPolicy", "SacSettings"]

@@ -94,6 +94,3 @@ def averaging_weights(log_densities: Tensor, seed: int = 0) -> Tensor:
     row_weights = exponential / exponential.sum(dim=1, keepdim=True)
     finite = log_densities.double().nan_to_num(nan=-1e6, posinf=1e6, neginf=-1e6)
     return torch.softmax(count * row_weights @ finite.T, dim=1).mean(dim=0)
-
-
-__all__ = ["AveragedModel", "average", "averaging_weights", "held_out_log_densities"]

@@ -305,6 +305,3 @@ def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
     gradient: Tensor = torch.cholesky_inverse(factor)
     # The gradient is symmetric; its transpose has the memory layout of the other matrices.
     return gradient.baddbmm_(solved, solved.transpose(1, 2), beta=0.5, alpha=-0.5).mT
-
-
-__all__ = ["DiscrepancyCovariance", "evidence_gradient", "fit_discrepancy", "fit_noise"]

@@ -284,6 +284,3 @@ def _factors(covariance: Tensor, noise_std: Tensor) -> tuple[Tensor, Tensor]:
     variance = covariance.diagonal(dim1=2, dim2=3).clamp_min(0.0) + noise_std[:, None] ** 2
     weight = 1.0 / variance
     return cholesky.to(noise_std), (weight / weight.mean()).to(noise_std)
-
-
-__all__ = ["DistillationSettings", "distil", "measurement_points"]

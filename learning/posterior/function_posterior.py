@@ -120,6 +120,3 @@ def simulate(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser:
         return torch.zeros((len(parameters), 0, len(normaliser.output_std)), dtype=torch.float64, device=inputs.device)
     with torch.no_grad():
         return normaliser.outputs(model(inputs, parameters)).double()
-
-
-__all__ = ["JITTER", "FunctionPosterior", "simulate"]

@@ -393,6 +393,3 @@ def _covariance(
     """Covariances (O, n, n) of discrepancy and noise; a row's noise variance is divided by its weight."""
     noise = torch.diag_embed((noise_std**2)[:, None] / row_weights + CHOLESKY_JITTER)
     return noise if discrepancy is None else discrepancy(inputs) + noise
-
-
-__all__ = ["infer"]

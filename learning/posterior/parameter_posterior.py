@@ -170,6 +170,3 @@ def _resample(weight: Tensor, generator: torch.Generator) -> Tensor:
     count = len(weight)
     points = torch.arange(count, dtype=weight.dtype) + torch.rand(1, generator=generator).to(weight.dtype)
     return torch.searchsorted(weight.cumsum(dim=0), (points / count).to(weight.device)).clamp_max(count - 1)
-
-
-__all__ = ["posterior_parameters"]

@@ -92,6 +92,3 @@ class ParticlePosterior:
 def input_clip_of(inputs: Tensor) -> Tensor:
     """Bounds (D,) of normalised training inputs (..., D), at least ``MIN_INPUT_CLIP``."""
     return inputs.abs().flatten(0, -2).amax(dim=0).clamp_min(MIN_INPUT_CLIP)
-
-
-__all__ = ["MIN_INPUT_CLIP", "ParticlePosterior", "input_clip_of"]

@@ -129,6 +129,3 @@ def _common_scale(square: Tensor, outputs: int, dof: float, prior_rows: float, p
         total = float((weight * square).sum()) + prior_rows * prior_square
         scale_square = max(total / (rows * outputs), MIN_SHARE**2)
     return math.sqrt(scale_square)
-
-
-__all__ = ["ResidualDistribution", "fit_residuals"]

@@ -142,6 +142,3 @@ def _to_raw(posterior: ParticlePosterior) -> Tensor:
     if units.decorrelation is not None:
         to_raw = torch.linalg.inv_ex(units.decorrelation.double()).inverse.T @ to_raw
     return to_raw
-
-
-__all__ = ["Assignment", "PosteriorSampler", "with_raw_outputs"]

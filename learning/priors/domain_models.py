@@ -254,17 +254,3 @@ class KinematicCar:
         heading = torch.sin(measured_yaw), torch.cos(measured_yaw)
         after = torch.stack([x, y, *heading, velocity_x, velocity_y, rate], dim=-1)
         return after - inputs[None, :, :7]
-
-
-__all__ = [
-    "DomainModel",
-    "KinematicCar",
-    "Pendulum",
-    "Sinusoids",
-    "detent",
-    "draw_parameters",
-    "position_friction",
-    "saturated_torque",
-    "uniform",
-    "within",
-]

@@ -101,6 +101,3 @@ def moments(draws: Tensor) -> tuple[Tensor, Tensor]:
 def _factored(mean: Tensor, covariance: Tensor, jitter: float) -> Marginal:
     eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     return Marginal(mean, torch.linalg.cholesky(covariance + jitter * eye))
-
-
-__all__ = ["JITTER", "Marginal", "RbfCovariance", "gaussian_process", "moments", "simulator_marginal"]

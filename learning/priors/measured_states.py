@@ -70,6 +70,3 @@ class DrawnMeasurement:
 
 def _ticks(states: Tensor) -> list[tuple[Tensor, ...]]:
     return [tuple(tick.unbind(dim=1)) for tick in states.unbind(dim=1)]
-
-
-__all__ = ["DrawnMeasurement"]

@@ -105,6 +105,3 @@ class MotorPendulum:
             omega = omega + step / 6.0 * (a[1] + 2.0 * (b[1] + c[1]) + d[1])
         after = torch.stack([torch.sin(theta), torch.cos(theta), omega], dim=-1)
         return after - inputs[None, :, :3]
-
-
-__all__ = ["SLIDING_RADPS", "MotorPendulum"]

@@ -188,6 +188,3 @@ class CarModel:
 def _is_excluded(effect: Effect) -> bool:
     """Whether the measurement model covers the effect, or it depends on the pose, which a row does not hold."""
     return effect.kind == "observation" or bool(effect.depends_on & {"place", "heading"})
-
-
-__all__ = ["CarModel", "known_ranges"]

@@ -109,6 +109,3 @@ def advance(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
     ], dim=1)  # fmt: skip
     encoded: Tensor = encode(after, push_action(decode_history(features), action))
     return encoded
-
-
-__all__ = ["CarDynamics", "OneStep", "StepInBody", "advance", "inputs_of"]

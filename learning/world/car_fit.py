@@ -324,17 +324,3 @@ _READ_ERRORS = (
 def _first_line(error: BaseException) -> str:
     """The first line of an error's message, or its type."""
     return next(iter(str(error).splitlines()), "") or type(error).__name__
-
-
-__all__ = [
-    "PAPER_METHODS",
-    "CarFitSettings",
-    "LearnedCar",
-    "Method",
-    "car_units",
-    "fit_car",
-    "load_car",
-    "load_car_arrays",
-    "save_car",
-    "save_car_arrays",
-]

@@ -172,17 +172,3 @@ RolloutModel = OneStep | HasRollouts
 def start_rollouts(model: RolloutModel, count: int, generator: torch.Generator) -> Rollouts:
     """Start N rollouts; steps of a model without a disturbance are independent."""
     return model.rollouts(count, generator) if isinstance(model, HasRollouts) else IndependentSteps(model)
-
-
-__all__ = [
-    "CHANNELS",
-    "DisturbanceProcess",
-    "DisturbedCar",
-    "DisturbedRollouts",
-    "HasRollouts",
-    "IndependentSteps",
-    "RolloutModel",
-    "Rollouts",
-    "change_by",
-    "start_rollouts",
-]

@@ -205,6 +205,3 @@ def _maximise_scale(
     with torch.no_grad():
         ahead, left, yaw = scales().tolist()
         return -float(loss()), (ahead, left, yaw)
-
-
-__all__ = ["RolloutErrors", "fit_disturbance", "pooled", "rollout_errors"]

@@ -80,6 +80,3 @@ def roll_out(windows: DriveWindows, change: Callable[[Tensor, int], Tensor]) -> 
     x, y = (v.cumsum(dim=1) for v in to_world(ahead, left, yaw - turn))
     gained = torch.stack(changes, dim=1)[..., 3:].cumsum(dim=1)
     return torch.cat([torch.stack([x, y, yaw], dim=-1), start[:, None] + gained], dim=-1)
-
-
-__all__ = ["DriveWindows", "roll_out"]

@@ -89,6 +89,3 @@ def _leave_one_out_nll(inputs: Tensor, outputs: Tensor) -> float:
     standardised, variance = leave_one_out(outputs, covariance, noise, row_weights)
     density = log_student(standardised**2, 1, STUDENT_DOF) - 0.5 * variance.log()
     return -float(density.sum(dim=1).mean())
-
-
-__all__ = ["HistoryChoice", "find_history"]

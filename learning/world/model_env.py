@@ -261,6 +261,3 @@ class ModelEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
         """False for each requested car."""
         return [False] * len(list(self._get_indices(indices)))
-
-
-__all__ = ["FEATURE_UNITS", "ModelEnv", "RolloutEpisodes", "policy_inputs", "policy_spaces"]

@@ -248,6 +248,3 @@ class _Functions:
 def _huber(error: Tensor, delta: float) -> Tensor:
     """Huber loss of each element (Huber 1964, "Robust estimation of a location parameter")."""
     return functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=delta)
-
-
-__all__ = ["RolloutFitSettings", "fit_rollouts"]

@@ -70,6 +70,3 @@ def _to_world(vector: Tensor, variance: Tensor, sin: Moments, cos: Moments, sin_
     x = cos[0] * ahead - sin[0] * left, cos[1] * ahead_square + sin[1] * left_square - cross_term
     y = sin[0] * ahead + cos[0] * left, sin[1] * ahead_square + cos[1] * left_square + cross_term
     return x, y
-
-
-__all__ = ["measured_seven_outputs", "seven_outputs"]
