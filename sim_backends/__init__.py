@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from sim_backends.car_parameters import CarParameters, MocapParameters, SimulatorConfig, preset_names
+from sim_backends.effects import EFFECTS
+from sim_backends.plant import Plant
+from sim_backends.registry import REGISTRY, ParameterInfo, register, registered
+from sim_backends.sensor import MocapSensor
+from sim_backends.simulated_car import SimulatedCar
 
 if TYPE_CHECKING:
     from sim_backends.batch.rollout import Rollout, rollout
-    from sim_backends.car_parameters import CarParameters, MocapParameters, SimulatorConfig, preset_names
-    from sim_backends.effects import EFFECTS
-    from sim_backends.plant import Plant
-    from sim_backends.registry import REGISTRY, ParameterInfo, register, registered
-    from sim_backends.sensor import MocapSensor
-    from sim_backends.simulated_car import SimulatedCar
 
 __all__ = [
     "EFFECTS",
@@ -31,25 +31,11 @@ __all__ = [
     "rollout",
 ]
 
-_MODULES = {
-    "CarParameters": "car_parameters",
-    "MocapParameters": "car_parameters",
-    "SimulatorConfig": "car_parameters",
-    "preset_names": "car_parameters",
-    "EFFECTS": "effects",
-    "Plant": "plant",
-    "REGISTRY": "registry",
-    "ParameterInfo": "registry",
-    "register": "registry",
-    "registered": "registry",
-    "Rollout": "batch.rollout",
-    "rollout": "batch.rollout",
-    "MocapSensor": "sensor",
-    "SimulatedCar": "simulated_car",
-}
-
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return getattr(importlib.import_module(f"sim_backends.{_MODULES[name]}"), name)
-    raise AttributeError(f"module 'sim_backends' has no attribute '{name}'")
+    """Import the batched simulator when it is first used, since torch loads slowly."""
+    if name not in ("Rollout", "rollout"):
+        raise AttributeError(f"module 'sim_backends' has no attribute '{name}'")
+    from sim_backends.batch import rollout as module
+
+    return getattr(module, name)

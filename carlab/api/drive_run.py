@@ -16,7 +16,7 @@ from carlab.core.errors import add_sentence
 if TYPE_CHECKING:
     from carlab.core.outcome import EndReason
     from carlab.experiment.episodes.session import EpisodeResult
-    from carlab.recording import RunDirectory
+    from carlab.recording.run_folder import RunDirectory
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +94,8 @@ def run_results(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResult
 
 def _draw(results: Sequence[EpisodeResult], path: Path) -> None:
     """Draw the episodes with complete ticks; an error or ^C leaves out the picture and does not end the program."""
-    from carlab.recording import read_episode, save_summary
+    from carlab.recording.mcap.source import read_episode
+    from carlab.recording.picture import save_summary
 
     try:
         episodes = [read_episode(result.path) for result in results if result.has_recorded_ticks]

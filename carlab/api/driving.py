@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from carlab.core.task_choice import TaskChoice
     from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
     from carlab.experiment.episodes.teleop_policy import TeleopPolicy
-    from carlab.recording import RunDirectory
+    from carlab.recording.run_folder import RunDirectory
     from sim_backends.car_parameters import SimulatorConfig
 
 KEY_THROTTLE = 0.4

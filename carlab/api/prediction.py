@@ -110,7 +110,7 @@ class PredictionErrors:
         Raises:
             DataError: a file cannot be written.
         """
-        from carlab.recording import episode_to_rrd
+        from carlab.recording.rerun.sink import episode_to_rrd
 
         first, written = Path(path), []
         several = len(self.score.episodes) > 1

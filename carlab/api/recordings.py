@@ -71,13 +71,15 @@ class Recording:
         if path.exists():
             raise DataError(f"{path} exists already; remove it or choose another name.")
         if name.endswith(".png"):
-            from carlab.recording import save_summary
+            from carlab.recording.picture import save_summary
 
             save_summary(self.episodes, path, self.path.name)
             return path
         if len(self.episodes) > 1:
             raise DataError(f"{self.path} holds {len(self.episodes)} episodes; a {path.suffix} file can hold only one.")
-        from carlab.recording import episode_to_rrd, write_csv, write_episode, write_parquet
+        from carlab.recording.csv.export import write_csv, write_parquet
+        from carlab.recording.mcap.sink import write_episode
+        from carlab.recording.rerun.sink import episode_to_rrd
 
         if name.endswith(".rrd"):
             episode_to_rrd(self.episode, path, self.path.name)
@@ -181,7 +183,8 @@ def save_run(run: Path | str, path: Path | str) -> Path:
     """
     from carlab.experiment.campaign.report import PICTURE_FILE, learning_curve
     from carlab.experiment.campaign.run_recording import readable_episodes, write_run_recording
-    from carlab.recording import RunDirectory, save_summary
+    from carlab.recording.picture import save_summary
+    from carlab.recording.run_folder import RunDirectory
 
     run, path = Path(run), Path(path)
     if not is_run_folder(run):

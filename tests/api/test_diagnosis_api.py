@@ -191,7 +191,9 @@ def test_copy_of_a_fitted_recording_is_not_held_out(tmp_path: Path) -> None:
 
 def test_each_predicted_recording_is_saved_with_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = []
-    monkeypatch.setattr("carlab.recording.episode_to_rrd", lambda episode, file, name, overlays: names.append(name))
+    monkeypatch.setattr(
+        "carlab.recording.rerun.sink.episode_to_rrd", lambda episode, file, name, overlays: names.append(name)
+    )
     paths = [csv_file(tmp_path / name) for name in ("first.csv", "second.csv")]
     carlab.predict(paths, horizon_s=0.5).save(tmp_path / "predicted.rrd")
     assert names == ["first.csv", "second.csv"]

@@ -15,6 +15,7 @@ import carlab
 from carlab.core.errors import ActuatorFaultError, ConfigError, NotReadyError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import CarState
+from carlab.recording import picture
 from sim_backends.simulated_car import SimulatedCar
 
 
@@ -88,14 +89,14 @@ def interrupts_raise() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("interrupts_raise")
-@pytest.mark.parametrize("second", ["carlab.recording.save_summary", "sim_backends.simulated_car.SimulatedCar.close"])
+@pytest.mark.parametrize(
+    "second", ["carlab.recording.picture.save_summary", "sim_backends.simulated_car.SimulatedCar.close"]
+)
 def test_second_interrupt_after_the_drive_loses_no_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, second: str
 ) -> None:
     """The first ^C ends the drive at tick 3; the second one comes while the car is closed or the picture is drawn."""
-    import carlab.recording
-
-    original = SimulatedCar.close if second.endswith("close") else carlab.recording.save_summary
+    original = SimulatedCar.close if second.endswith("close") else picture.save_summary
     monkeypatch.setattr(second, signalling(original))
 
     def on_tick(tick: Any) -> None:

@@ -10,7 +10,7 @@ from recorded_drives import drive
 from carlab.api.cars import load_car
 from carlab.cli.prove_real import car_path
 from carlab.jobs import child_jobs
-from carlab.recording import write_csv
+from carlab.recording.csv.export import write_csv
 from sim_backends import SimulatorConfig
 
 Carlab = Callable[..., tuple[int, str]]

@@ -82,7 +82,7 @@ def test_error_of_the_picture_does_not_replace_the_result(
     def refuse(*arguments: object) -> None:
         raise ValueError("no font")
 
-    monkeypatch.setattr("carlab.recording.save_summary", refuse)
+    monkeypatch.setattr("carlab.recording.picture.save_summary", refuse)
     code, text = carlab("drive", "--policy", "neutral", "--ticks", "5", "--out", tmp_path, "--no-rerun")
     assert code == 0
     assert "Recorded in" in text
