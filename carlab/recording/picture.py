@@ -41,13 +41,11 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
     Raises:
         DataError: there is no episode, or the picture cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     if not episodes:
         raise DataError("There is no episode to draw; record one with carlab drive.")
     figure = Figure(figsize=(13.0, 7.6), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(4, 2, width_ratios=[1.15, 1.0])
     plan = figure.add_subplot(grid[:, 0])
     axes = [figure.add_subplot(grid[0, 1])]

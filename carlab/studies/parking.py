@@ -187,12 +187,10 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         curves: of all runs.
         path: file to write.
     """
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (reward, distance, parked) = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
+    figure = Figure(figsize=(15, 4.4), layout="constrained")
+    reward, distance, parked = figure.subplots(1, 3)
     rows = summarised(curves)
     ticks: list[int] = []
     labels: list[str] = []
@@ -226,4 +224,3 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         axis.grid(alpha=0.3)
         axis.xaxis.get_major_locator().set_params(integer=True)
     figure.savefig(path, dpi=130)
-    pyplot.close(figure)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib import pyplot
 from matplotlib.image import imread
 
 from carlab.studies.regression.methods import METHODS
@@ -32,9 +31,7 @@ ROWS = [
 
 @pytest.fixture
 def panels():
-    figure = picture(ROWS)
-    yield figure
-    pyplot.close(figure)
+    return picture(ROWS)
 
 
 def test_each_method_has_a_line_and_its_variant_another_line_style(panels):
@@ -52,13 +49,10 @@ def test_each_method_has_a_line_and_its_variant_another_line_style(panels):
 def test_methods_of_another_study_have_different_colours(known):
     priors = ("none (gp-posterior)", "kinematic", "nominal", "diagnosed")
     figure = picture([row(name, n, -6.0 - k) for k, name in enumerate(known + priors) for n in (20, 50)])
-    try:
-        lines = figure.axes[0].get_lines()
-        assert len({line.get_color() for line in lines}) == len(known + priors) == len(lines)
-        widths = {line.get_label(): line.get_linewidth() for line in lines}
-        assert widths["diagnosed"] > widths["kinematic"]
-    finally:
-        pyplot.close(figure)
+    lines = figure.axes[0].get_lines()
+    assert len({line.get_color() for line in lines}) == len(known + priors) == len(lines)
+    widths = {line.get_label(): line.get_linewidth() for line in lines}
+    assert widths["diagnosed"] > widths["kinematic"]
 
 
 def test_outlier_is_printed_at_the_edge_and_does_not_stretch_the_axis(panels):
@@ -73,11 +67,8 @@ def test_outlier_is_printed_at_the_edge_and_does_not_stretch_the_axis(panels):
 
 def test_axis_covers_all_values_if_most_of_them_are_outliers():
     figure = picture([row("gp-sim-posterior", 2, -0.2), row("FSVGD", 2, 168.0), row("GreyBox", 2, 36.0)])
-    try:
-        assert figure.axes[0].get_ylim()[1] > 168.0
-        assert not figure.axes[0].texts
-    finally:
-        pyplot.close(figure)
+    assert figure.axes[0].get_ylim()[1] > 168.0
+    assert not figure.axes[0].texts
 
 
 def test_axis_of_distant_likelihoods_has_at_least_three_ticks():
@@ -86,7 +77,6 @@ def test_axis_of_distant_likelihoods_has_at_least_three_ticks():
     axis = figure.axes[0]
     low, high = axis.get_ylim()
     assert sum(low <= tick <= high for tick in axis.get_yticks()) >= 3
-    pyplot.close(figure)
 
 
 def test_colour_of_a_method_is_unique_and_the_same_in_every_picture():
@@ -95,7 +85,6 @@ def test_colour_of_a_method_is_unique_and_the_same_in_every_picture():
         figure = picture([row(name, 5, -1.0) for name in names])
         for line in figure.axes[1].get_lines():
             assert colours.setdefault(line.get_label(), line.get_color()) == line.get_color()
-        pyplot.close(figure)
     variants = 3  # sim-posterior, sim-fsvgd-corrected and fsvgd-corrected have the colour of the whole method.
     assert len(set(colours.values())) == len(METHODS) - variants
 
@@ -128,12 +117,9 @@ def test_single_seed_has_no_band_and_failed_fit_no_point():
     figure = picture(
         [*(replace(r, seeds=1, **no_errors) for r in ROWS if (r.method, r.rows) != ("SysID", 50)), failed_row]
     )
-    try:
-        for axis in figure.axes:
-            assert not axis.collections
-            assert [len(line.get_ydata()) for line in axis.get_lines()] == [2, 2, 1, 2]
-    finally:
-        pyplot.close(figure)
+    for axis in figure.axes:
+        assert not axis.collections
+        assert [len(line.get_ydata()) for line in axis.get_lines()] == [2, 2, 1, 2]
 
 
 def test_durations_far_apart_are_all_visible(tmp_path):
@@ -147,5 +133,4 @@ def test_durations_far_apart_are_all_visible(tmp_path):
     low, high = axis.get_ylim()
     assert 0.0 < low < 0.002
     assert high > 900.0
-    pyplot.close(figure)
     draw(rows, tmp_path / "study.png")

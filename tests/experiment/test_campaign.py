@@ -175,18 +175,18 @@ def test_picture_has_one_axis_a_panel_and_no_cut_text(
     interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figures: list[Any] = []
-    monkeypatch.setattr("matplotlib.pyplot.close", figures.append)
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, path, dpi: figures.append(figure))
     episode = read_episode(interrupted.run.recordings()[0])
     windows = predict_windows(load_car(interrupted.run.models / "0001" / "dynamics.pt"), episode)
     row = replace(interrupted.figures[0], verdict="left", diagnosis="The simulator leaves an error. " * 20)
     draw([row], 1, episode, windows, interrupted.plan.task, tmp_path / "picture.png")
     (figure,) = figures
+    figure.draw_without_rendering()
     boxes = [axis.get_position().bounds for axis in figure.axes]
     assert len(set(boxes)) == len(boxes) == 3 + 6, "return, distance, plan and six states; no likelihood yet"
-    renderer = figure.canvas.get_renderer()
     texts = [figure._suptitle, *(axis.title for axis in figure.axes)]
     for text in texts:
-        box = text.get_window_extent(renderer)
+        box = text.get_window_extent()
         assert box.x0 >= 0, text.get_text()
         assert box.x1 <= figure.bbox.width, text.get_text()
     assert figure._suptitle.get_text().replace("\n", " ").strip() == row.diagnosis.strip()

@@ -9,7 +9,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from carlab.benchmark.intervals import share_text, wilson
@@ -73,7 +72,6 @@ def curve_rows(curves: Iterable[Curve]) -> list[tuple[str, ...]]:
 def draw_detection(path: Path, curves: Sequence[Curve]) -> None:
     """Draw the curves with their intervals; the format follows from the name of the file."""
     figure = Figure(figsize=(7.0, 4.0 + 0.2 * len(curves)), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for number, curve in enumerate(curves):
         shift = 1.0 + 0.03 * (number - 0.5 * (len(curves) - 1))

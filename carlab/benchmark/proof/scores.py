@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from carlab.benchmark.effects.catalogue import EFFECT_IDS
@@ -190,7 +189,6 @@ def draw_confusion(path: Path, rows: Iterable[Row]) -> None:
     """Draw the confusion matrix; correct names are on the diagonal."""
     concealed, answers, counts = confusion(rows)
     figure = Figure(figsize=(3.5 + 0.3 * len(answers), 2.5 + 0.28 * len(concealed)), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")

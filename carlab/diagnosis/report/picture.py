@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
@@ -42,7 +41,6 @@ def draw_picture(diagnosis: Diagnosis, figure_data: FigureData, path: Path) -> N
         path: the file; an existing one is replaced.
     """
     figure = Figure(figsize=(13.0, 4.6), layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
     shown = [e for e in figure_data.traces if e.marked]
     panes = figure.subplots(1, 1 + min(len(shown), 2), squeeze=False)[0]
     _draw_scores(panes[0], figure_data)

@@ -65,12 +65,9 @@ def draw(
         task: goal and arena.
         path: file to write.
     """
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure: Any = pyplot.figure(figsize=(16, 9))
+    figure: Any = Figure(figsize=(16, 9))
     figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
     if rows[-1].verdict:
         figure.suptitle(textwrap.fill(rows[-1].diagnosis, CHARACTERS_PER_LINE), fontsize=9, x=0.01, ha="left")
@@ -85,7 +82,6 @@ def draw(
     for axis, k in zip(lower.subplots(1, len(states), squeeze=False)[0], states, strict=True):
         _state(axis, k, episode, predictions)
     figure.savefig(path, dpi=120)
-    pyplot.close(figure)
 
 
 def _has_data(rows: Sequence[EpisodeFigures], curve: Curve) -> bool:

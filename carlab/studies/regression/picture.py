@@ -40,11 +40,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         rows: of one case, with a fit that did not fail.
         path: to write to.
     """
-    from matplotlib import pyplot
-
-    figure = picture(rows)
-    figure.savefig(path, dpi=130)
-    pyplot.close(figure)
+    picture(rows).savefig(path, dpi=130)
 
 
 def picture(rows: Sequence[Row]) -> Figure:
@@ -53,15 +49,13 @@ def picture(rows: Sequence[Row]) -> Figure:
     Fits that failed are left out; at least one must have succeeded. A method has the same colour in every picture.
     Values far above the others are arrows at the upper edge with their number.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
     rows = [row for row in rows if row.seeds]
     methods = list(dict.fromkeys(row.method for row in rows))
     counts = sorted({row.rows for row in rows})
-    figure, axes = pyplot.subplots(2, 2, figsize=SIZE_INCHES, layout="constrained")
+    figure = Figure(figsize=SIZE_INCHES, layout="constrained")
+    axes = figure.subplots(2, 2)
     for axis, name in zip(axes.flat, FIGURES, strict=True):
         highest = _highest(rows, name)
         for method in methods:
