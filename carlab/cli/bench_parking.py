@@ -6,7 +6,7 @@ import itertools
 import math
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -15,6 +15,7 @@ from carlab.cli.bench_output import command, write_figures
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.core.errors import ConfigError
+from carlab.core.json_files import plain
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd, read_files, write_files
 from carlab.jobs.child_processes import ONE_THREAD
 
@@ -216,7 +217,7 @@ def _report(curves: list[Curve], options: BenchOptions) -> None:
         table("Cars that differ from the prior", columns, [_arm_row(row) for row in arms])
     if options.out is not None:
         content = as_json(curves, command())
-        write_figures(options.out, content | ({"arms": [row.to_dict() for row in arms]} if arms else {}))
+        write_figures(options.out, content | ({"arms": [plain(asdict(row)) for row in arms]} if arms else {}))
         picture: Path = options.out.with_suffix(".png")
         draw(curves, picture)
         console.print(f"{options.out}, {picture}, {options.runs}")

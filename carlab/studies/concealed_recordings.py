@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from carlab.benchmark.cases.effect_pairs import PAIRS
-from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.cases.proof_set import PAIRS, CaseSpec
 from carlab.benchmark.world.measurement import write_csv
 from carlab.core.errors import ConfigError
 
@@ -31,6 +30,6 @@ def record_pair(number: int, folder: Path, training_s: float, held_out_s: float)
     case = pair.make()
     folder.mkdir(parents=True, exist_ok=True)
     case.nominal.write(folder / CAR_NAME)
-    write_csv(folder / TRAINING_NAME, dict(case.fit))
-    write_csv(folder / HELD_OUT_NAME, dict(case.hold))
+    write_csv(folder / TRAINING_NAME, case.fit)
+    write_csv(folder / HELD_OUT_NAME, case.hold)
     return pair

@@ -68,11 +68,6 @@ class ArmFigures:
     coverage: float
     latest_against_nominal: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Values for a JSON file; NaN becomes null."""
-        values = {name: getattr(self, name) for name in self.__slots__}
-        return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}
-
 
 def write_reality(name: str, folder: Path) -> Path:
     """Write the car file of a reality, and return its path. Raises DataError if it cannot be written."""

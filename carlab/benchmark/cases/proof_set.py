@@ -59,6 +59,15 @@ class CaseSpec:
         return cls(**{**values, "effects": tuple(values["effects"]), "conditions": conditions})
 
 
+PAIRS = (
+    CaseSpec("pair", 2_000_248, ("motor_lag", "mocap_yaw_misalignment"), "catalogue", max(STRENGTHS)),
+    CaseSpec("pair", 2_000_251, ("throttle_deadband", "velocity_filter_lag"), "other", max(STRENGTHS)),
+    CaseSpec("pair", 2_000_254, ("steering_rate_limit", "longitudinal_slip"), "catalogue", max(STRENGTHS)),
+)
+"""Pairs of concealed effects for studies of learning: the first pairs of the proof (seed 0) of excess 1 or more without
+effects of time or place, which a one-step model cannot represent. They were chosen before any learning on them."""
+
+
 def full_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
     """Cases of the protocol: 4 per effect, 100 null, 40 pairs, 40 outside, 2 per data fault, 40 of random physics.
 
