@@ -27,69 +27,63 @@ from carlab.benchmark.world.simulation import FloatArray
 STANDARD_ERRORS = 2.0
 
 
-# Change of (steering and throttle (n, 2), step lengths (n,) [s]) by the parameter of an effect, for a car.
-SizedChange = Callable[[FloatArray, FloatArray, float, BaseCar], FloatArray]
+def mapped(channel: int, function: Callable[[FloatArray], FloatArray]) -> CommandChange:
+    """Change of a channel (0 steering, 1 throttle) by a function without memory, of the commands (n,)."""
 
-
-def _lag(channel: int) -> SizedChange:
-    def smooth(series: FloatArray, steps_s: FloatArray, value: float, car: BaseCar) -> FloatArray:
+    def change(series: FloatArray, steps_s: FloatArray) -> FloatArray:
         out = series.copy()
-        lag, state = max(value, 1e-4), 0.0
+        out[:, channel] = function(series[:, channel])
+        return out
+
+    return change
+
+
+def _lag(channel: int, time_constant_s: float) -> CommandChange:
+    def smooth(series: FloatArray, steps_s: FloatArray) -> FloatArray:
+        out = series.copy()
+        lag_s, state = max(time_constant_s, 1e-4), 0.0
         for k, (wanted, step_s) in enumerate(zip(series[:, channel].tolist(), steps_s.tolist(), strict=True)):
-            decay = np.exp(-step_s / lag)
-            out[k, channel] = wanted + (state - wanted) * lag / step_s * (1.0 - decay)
+            decay = np.exp(-step_s / lag_s)
+            out[k, channel] = wanted + (state - wanted) * lag_s / step_s * (1.0 - decay)
             state = wanted + (state - wanted) * decay
         return out
 
     return smooth
 
 
-def _map(channel: int, function: Callable[[FloatArray, float, BaseCar], FloatArray]) -> SizedChange:
-    def apply(series: FloatArray, steps_s: FloatArray, value: float, car: BaseCar) -> FloatArray:
-        out = series.copy()
-        out[:, channel] = function(series[:, channel], value, car)
-        return out
-
-    return apply
-
-
-def _late(channels: tuple[int, ...]) -> SizedChange:
-    def shift(series: FloatArray, steps_s: FloatArray, value: float, car: BaseCar) -> FloatArray:
+def _delay(channels: tuple[int, ...], delay_s: float) -> CommandChange:
+    def shift(series: FloatArray, steps_s: FloatArray) -> FloatArray:
         edges = np.concatenate([[0.0], np.cumsum(steps_s)])
         out = series.copy()
         for k in channels:
-            whole = np.concatenate([[0.0], np.cumsum(series[:, k] * steps_s)])
-            out[:, k] = np.diff(np.interp(edges - value, edges, whole)) / steps_s
+            integral = np.concatenate([[0.0], np.cumsum(series[:, k] * steps_s)])
+            out[:, k] = np.diff(np.interp(edges - delay_s, edges, integral)) / steps_s
         return out
 
     return shift
 
 
-def _deadband(u: FloatArray, width: float, car: BaseCar) -> FloatArray:
-    half = 0.5 * width / car.max_angle
-    return u - np.clip(u, -half, half)
+def _dead_band(half: float) -> CommandChange:
+    return mapped(0, lambda u: u - np.clip(u, -half, half))
 
 
-# By effect: change of the acting commands, and range of its parameter.
-CHEAP: dict[str, tuple[SizedChange, tuple[float, float]]] = {
-    "command_delay": (_late((0, 1)), (-0.03, 0.15)),
-    "mocap_latency": (_late((0, 1)), (-0.03, 0.15)),
-    "steering_delay": (_late((0,)), (0.0, 0.2)),
-    "throttle_delay": (_late((1,)), (0.0, 0.3)),
-    "steering_lag": (_lag(0), (0.0, 0.3)),
-    "motor_lag": (_lag(1), (0.0, 0.5)),
-    "steering_deadband": (_map(0, _deadband), (0.0, 0.3)),
-    "steering_offset": (_map(0, lambda u, v, car: u + v / car.max_angle), (-0.1, 0.1)),
-    "steering_asymmetry": (_map(0, lambda u, v, car: u * (1.0 + v * np.sign(u))), (-0.5, 0.5)),
-    "throttle_deadband": (_map(1, lambda u, v, car: np.sign(u) * np.maximum(np.abs(u) - v, 0) / (1 - v)), (0.0, 0.3)),
-    "throttle_nonlinearity": (_map(1, lambda u, v, car: np.sign(u) * np.abs(u) ** v), (0.4, 2.5)),
+# By effect: change of the acting commands by a value v of its parameter in a car, and the range of the parameter.
+CHEAP: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, float]]] = {
+    "command_delay": (lambda v, car: _delay((0, 1), v), (-0.03, 0.15)),
+    "mocap_latency": (lambda v, car: _delay((0, 1), v), (-0.03, 0.15)),
+    "steering_delay": (lambda v, car: _delay((0,), v), (0.0, 0.2)),
+    "throttle_delay": (lambda v, car: _delay((1,), v), (0.0, 0.3)),
+    "steering_lag": (lambda v, car: _lag(0, v), (0.0, 0.3)),
+    "motor_lag": (lambda v, car: _lag(1, v), (0.0, 0.5)),
+    "steering_deadband": (lambda v, car: _dead_band(0.5 * v / car.max_angle), (0.0, 0.3)),
+    "steering_offset": (lambda v, car: mapped(0, lambda u: u + v / car.max_angle), (-0.1, 0.1)),
+    "steering_asymmetry": (lambda v, car: mapped(0, lambda u: u * (1.0 + v * np.sign(u))), (-0.5, 0.5)),
+    "throttle_deadband": (
+        lambda v, car: mapped(1, lambda u: np.sign(u) * np.maximum(np.abs(u) - v, 0) / (1 - v)),
+        (0.0, 0.3),
+    ),
+    "throttle_nonlinearity": (lambda v, car: mapped(1, lambda u: np.sign(u) * np.abs(u) ** v), (0.4, 2.5)),
 }
-
-
-def command_change(name: str, value: float, car: BaseCar) -> CommandChange:
-    """The change of the acting commands by an effect of CHEAP with a value of its parameter."""
-    change = CHEAP[name][0]
-    return lambda series, steps_s: change(series, steps_s, value, car)
 
 
 def indistinguishable(
@@ -122,10 +116,10 @@ def indistinguishable(
 
 
 def _window_losses(name: str, nominal: BaseCar, recordings: list[Recording], floor: FloatArray) -> FloatArray:
-    _, bounds = CHEAP[name]
+    change_of, bounds = CHEAP[name]
 
     def cut(value: float) -> list[Windows]:
-        changes = [command_change(name, value, nominal)]
+        changes = [change_of(value, nominal)]
         return [cut_windows(r, nominal, every_s=1.0, changes=changes).with_floor(floor) for r in recordings]
 
     def cost(value: float) -> float:
