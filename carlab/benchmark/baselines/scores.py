@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from carlab.benchmark.baselines.run import BASELINES, NAMES_NOTHING
-from carlab.benchmark.intervals import wilson
+from carlab.benchmark.intervals import share_text
 
 Row = Mapping[str, Any]
 COLUMNS = ("tool", *BASELINES)
@@ -98,7 +98,4 @@ def _cell(value: Mapping[str, Any] | None) -> str:
         return "-"
     if "median" in value:
         return f"{value['median']:.2f}"
-    if not value["count"]:
-        return "-"
-    low, high = wilson(value["hits"], value["count"])
-    return f"{value['hits'] / value['count']:.2f} ({low:.2f}-{high:.2f})"
+    return share_text(value["hits"], value["count"])

@@ -68,17 +68,21 @@ def steering_deadband(world: World, p: Parameters) -> None:
     world.steering_maps.append(lambda d: d - min(max(d, -half), half))
 
 
-def steering_backlash(world: World, p: Parameters) -> None:
-    """Play operator."""
-    half = 0.5 * p["play"]
+def play(width: float) -> Callable[[float], float]:
+    """Play operator: the output moves only to stay within half the width of the input."""
     held = 0.0
 
-    def follow(d: float) -> float:
+    def follow(value: float) -> float:
         nonlocal held
-        held = min(max(held, d - half), d + half)
+        held = min(max(held, value - 0.5 * width), value + 0.5 * width)
         return held
 
-    world.steering_maps.append(follow)
+    return follow
+
+
+def steering_backlash(world: World, p: Parameters) -> None:
+    """Play of the steering."""
+    world.steering_maps.append(play(p["play"]))
 
 
 @hook("steer")

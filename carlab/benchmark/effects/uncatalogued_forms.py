@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from carlab.benchmark.effects.catalogue import Draw, Form, FormName, Parameters, heading, hook, plain, signed
+from carlab.benchmark.effects.command_forms import play
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.physics import Instant, World
 from carlab.benchmark.world.simulation import FloatArray
@@ -101,14 +102,7 @@ def cable(now: Instant, p: Parameters, car: BaseCar) -> None:
 
 def motor_hysteresis(world: World, p: Parameters) -> None:
     """A motor controller that holds its throttle until the command changes by more than half a width."""
-    half, held = 0.5 * p["width"], 0.0
-
-    def follow(u: float) -> float:
-        nonlocal held
-        held = min(max(held, u - half), u + half)
-        return held
-
-    world.throttle_maps.append(follow)
+    world.throttle_maps.append(play(p["width"]))
 
 
 def compliance_steer(world: World, p: Parameters) -> None:
