@@ -28,6 +28,6 @@ def test_diagnosis_does_not_need_python_on_the_path(monkeypatch: pytest.MonkeyPa
         "print(pathlib.Path('car.toml').read_text())"
     )
     (row,) = module.study(tmp_path / "study", "drift", [3], command=(PYTHON, "-c", script))
-    assert (row["exit_status"], row["words"].strip()) == (0, "content of car.toml")
+    assert (row["exit_status"], row["output"].strip()) == (0, "content of car.toml")
     assert (tmp_path / "study" / "seed_3" / "model.toml").read_text() == "fitted"
     assert not (tmp_path / "study" / "seed_3" / "report.html").exists()

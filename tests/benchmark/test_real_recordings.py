@@ -231,6 +231,13 @@ def report(*named: tuple[str, str, float], others: tuple[str, ...] = ()) -> dict
     return {"schema": "carlab.compare/1", "verdict": "changed", "changes": changes}
 
 
+def test_failures_state_the_reason_of_a_missing_report() -> None:
+    rows = {"a": score_comparison(answer("steering_delay", ["steering_delay"]), None, {})}
+    add_visibility(rows)
+    page = real_results_page({}, rows, {"a": {"exit_status": -9, "output": "reading\nKilled"}})
+    assert "* a: single, steering_delay (middle): no report (exit status -9): Killed" in page
+
+
 def test_size_is_added_to_the_model_of_the_reference() -> None:
     truth = answer("steering_delay", ["steering_delay"])
     model = {"effects": {"steering_delay": {"delay": 0.03}}}

@@ -149,9 +149,9 @@ def test_missing_report_is_a_miss_and_wrong_schema_an_error() -> None:
 def test_failures_state_the_reason_of_a_missing_report() -> None:
     row = score_case(answer(), None)
     runs = {
-        "a": {"exit_status": None, "words": "worker lost: the node died"},
-        "b": {"exit_status": None, "words": "ended after 1800 s"},
-        "c": {"exit_status": -9, "words": "reading\nKilled"},
+        "a": {"exit_status": None, "output": "worker lost: the node died"},
+        "b": {"exit_status": None, "output": "ended after 1800 s"},
+        "c": {"exit_status": -9, "output": "reading\nKilled"},
     }
     assert failures(dict.fromkeys(runs, row), runs).splitlines() == [
         "* a: single steering_lag: no report: worker lost: the node died",
@@ -280,4 +280,4 @@ def test_failed_or_hung_diagnosis_is_recorded(tmp_path: Path) -> None:
     (run,) = proof.reports().values()
     assert run["report"] is None
     assert run["exit_status"] == 1
-    assert "no such verb" in run["words"]
+    assert "no such verb" in run["output"]

@@ -60,19 +60,21 @@ def failures(rows: Mapping[str, Row], runs: Mapping[str, Mapping[str, Any]]) -> 
     """Return one line for each case with a wrong answer."""
     lines = []
     for name, row in sorted(rows.items(), key=lambda item: (item[1]["kind"], item[1]["true"], item[0])):
-        run = runs.get(name, {})
         true = " + ".join(row["true"]) or row["kind"]
         answered = " + ".join(row["named"]) or row["verdict"]
         strength = f", excess {row['excess']:.1f}" if row["excess"] else ""
         strength += "".join(f", {condition}" for condition in row["conditions"])
         if not row["reported"]:
-            words = str(run.get("words", "")).strip().splitlines()
-            status = run.get("exit_status")  # None after a time-out or the loss of a worker, which the words state
-            why = "" if status is None else f" (exit status {status})"
-            lines.append(f"* {name}: {row['kind']} {true}: no report{why}: {words[-1] if words else ''}")
+            lines.append(f"* {name}: {row['kind']} {true}: {no_report(runs[name])}")
         elif not right(row):
             lines.append(f"* {name}: {row['kind']} {true}{strength}: answered {answered}")
     return "\n".join(lines) or "None."
+
+
+def no_report(run: Mapping[str, Any]) -> str:
+    """Return why a case has no report: the exit status and the last line of the output, from ``run.json``."""
+    status, lines = run.get("exit_status"), run.get("output", "").strip().splitlines()
+    return f"no report{'' if status is None else f' (exit status {status})'}: {lines[-1] if lines else ''}"
 
 
 def right(row: Row) -> bool:

@@ -167,12 +167,4 @@ class Proof(SealedRun):
         if true_effects:
             command += ("--effects", *true_effects)
         outputs = ("out/report.json", "out/decisions.json", "out/model.toml")
-        job = ChildJob(command, self.timeout_s, self._handed(name), outputs, environment=self.environment)
-        done = self.executor.run(job, self.abandon)
-        end = done.end
-        if end.abandoned:
-            return end
-        done.write_outputs(to)
-        run = {"exit_status": end.exit_status, "seconds": round(end.seconds, 3), "jobs": self.executor.jobs}
-        write_json(to / "run.json", {**run, "peak_memory_mib": round(end.peak_memory_mib, 1), "words": end.output})
-        return end
+        return self.run_tool(command, self._handed(name), outputs, to)

@@ -12,7 +12,7 @@ from carlab.benchmark.cases.seal import check, digest, file_digest
 from carlab.benchmark.proof.worker import write_json
 from carlab.core.errors import DataError
 from carlab.core.json_files import read_json
-from carlab.jobs.child_jobs import Executor, LocalExecutor
+from carlab.jobs.child_jobs import ChildJob, Executor, LocalExecutor
 from carlab.jobs.child_processes import ONE_THREAD, ChildEnd, run_parallel
 
 Progress = Callable[[str, int, int, str], None]
@@ -127,6 +127,24 @@ class SealedRun:
             finished=finished,
         )
         return complete and not stopped
+
+    def run_tool(
+        self, command: tuple[str, ...], inputs: Mapping[str, bytes], outputs: tuple[str, ...], to: Path
+    ) -> ChildEnd:
+        """Run the tool on one case; unless it is abandoned, its outputs and ``run.json`` are written into ``to``.
+
+        ``run.json`` has the exit status (None after a time-out or the loss of a worker, which the output states), the
+        end of the output, seconds, peak memory, and the number of parallel jobs.
+        """
+        job = ChildJob(command, self.timeout_s, inputs, outputs, environment=self.environment)
+        done = self.executor.run(job, self.abandon)
+        end = done.end
+        if not end.abandoned:
+            done.write_outputs(to)
+            run = {"exit_status": end.exit_status, "output": end.output, "jobs": self.executor.jobs}
+            times = {"seconds": round(end.seconds, 3), "peak_memory_mib": round(end.peak_memory_mib, 1)}
+            write_json(to / "run.json", run | times)
+        return end
 
     def results(self, folder: str, file: str) -> dict[str, dict[str, Any]]:
         """``run.json`` of each case with its ``report`` from another file (None if missing or not JSON)."""

@@ -157,7 +157,7 @@ def study(
         except AbandonedError:
             break
         except DataError as error:
-            rows.append({"seed": seed, "verdict": None, "exit_status": None, "seconds": 0.0, "words": str(error)})
+            rows.append({"seed": seed, "verdict": None, "exit_status": None, "seconds": 0.0, "output": str(error)})
             continue
         progress(f"seed {seed}: diagnosing")
         run = _diagnose(handed, command, timeout_s, abandon)
@@ -181,7 +181,7 @@ def _diagnose(
     for file in REPORT_FILES:
         (handed / file).unlink(missing_ok=True)
     done.write_outputs(handed)
-    return {"exit_status": done.end.exit_status, "seconds": round(done.end.seconds, 1), "words": done.end.output}
+    return {"exit_status": done.end.exit_status, "seconds": round(done.end.seconds, 1), "output": done.end.output}
 
 
 def _row(car: PublicCar, seed: int, run: dict[str, Any], path: Path) -> dict[str, Any]:

@@ -36,7 +36,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         parts.append(f"## Seed {row['seed']}")
         if row["verdict"] is None:
-            last = str(row["words"]).strip().splitlines()[-1:] or ["no output"]
+            last = str(row["output"]).strip().splitlines()[-1:] or ["no output"]
             parts.append(f"No report (exit status {row['exit_status']}): {last[0]}")
             continue
         parts += [f"**{e['id']}**: {e['sentence'] or 'no sentence'}\n\n{_evidence(e)}" for e in row["named"]]

@@ -163,13 +163,7 @@ class RealProof(SealedRun):
             arguments = [*changed, "--effects", *CONCEALABLE_EFFECTS, *ONE_PROCESS]
         command = (*self.command, self.tool, *arguments, "--car", MODEL, "--out", "out")
         inputs = {path.name: path.read_bytes() for path in (*untouched, self._model(name), *others)}
-        job = ChildJob(command, self.timeout_s, inputs, (f"out/{self.report_file}",), environment=self.environment)
-        done = self.executor.run(job, self.abandon)
-        if not done.end.abandoned:
-            to = self.root / "answered" / name
-            done.write_outputs(to)
-            write_json(to / "run.json", {**dataclasses.asdict(done.end), "jobs": self.executor.jobs})
-        return done.end
+        return self.run_tool(command, inputs, (f"out/{self.report_file}",), self.root / "answered" / name)
 
 
 def write_smaller_unit(car: Path, to: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from carlab.benchmark.intervals import share_text
 from carlab.benchmark.proof.matching import Correctness, assigned
-from carlab.benchmark.proof.results_page import markdown
+from carlab.benchmark.proof.results_page import markdown, no_report
 from carlab.benchmark.real.kinds import KINDS
 from carlab.core.errors import DataError
 
@@ -269,11 +269,10 @@ def _failures(rows: Rows, runs: Rows) -> list[str]:
     lines = []
     for name, row in sorted(rows.items(), key=lambda item: (item[1]["kind"], item[1]["true"], item[0])):
         is_right = not row["false_alarm"] if row["kind"] == "null" else row["first_with_sets"] and not row["spurious"]
-        if row["verdict"] == "no report":
-            words = str(runs.get(name, {}).get("words", "")).strip().splitlines()
-            lines.append(f"* {name}: {row['kind']} {' + '.join(row['true'])}: no report: {words[-1] if words else ''}")
-        elif not is_right:
-            sizes = ", ".join(("small", "middle", "large")[k] for k in row["size_index"])
-            true = f"{' + '.join(row['true'])} ({sizes})" if row["true"] else "nothing"
-            lines.append(f"* {name}: {row['kind']}, {true}: answered {' + '.join(row['named']) or row['verdict']}")
+        if is_right and _reported(row):
+            continue
+        sizes = ", ".join(("small", "middle", "large")[k] for k in row["size_index"])
+        true = f"{' + '.join(row['true'])} ({sizes})" if row["true"] else "nothing"
+        answered = f"answered {' + '.join(row['named']) or row['verdict']}" if _reported(row) else no_report(runs[name])
+        lines.append(f"* {name}: {row['kind']}, {true}: {answered}")
     return lines
