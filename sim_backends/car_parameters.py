@@ -12,15 +12,13 @@ from typing import Any, Self
 from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys, number
 from sim_backends.array_ops import FLOATS
-from sim_backends.effects import EFFECTS, DelayEffect, MeasuredCurve
+from sim_backends.effects import EFFECTS, MeasuredCurve, delays_s
 from sim_backends.effects.base import MODEL_KINDS, ModelKind
 from sim_backends.measurement import LATENCY, MeasurementModel
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
 TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
 """Tables of a car file with the simulator's parameters, without ``[hardware]``."""
-
-
 _FIELD_OF = {info.name: info.field for info in REGISTRY.values() if info.field}
 
 
@@ -94,12 +92,13 @@ class SimulatorConfig:
                 for name, info in known.items()
             }
         object.__setattr__(self, "effects", complete)
-        for name, value in self.values().items():
+        values = self.values()
+        for name, value in values.items():
             if problem := REGISTRY[name].problem(value):
                 raise ConfigError(problem)
         for name, (low, high) in self.priors.items():
-            if not low <= self.values()[name] <= high:
-                raise ConfigError(f"{name} = {self.values()[name]:g} lies outside its range {low:g} to {high:g}.")
+            if not low <= values[name] <= high:
+                raise ConfigError(f"{name} = {values[name]:g} lies outside its range {low:g} to {high:g}.")
         check_keys(self.parameter_std, REGISTRY, "the standard deviations")
         for name, std in self.parameter_std.items():
             if not 0.0 < std < float("inf") or REGISTRY[name].choices:
@@ -151,14 +150,7 @@ class SimulatorConfig:
 
     def delays_s(self) -> tuple[float, float]:
         """Total delay of steering and of throttle with all effects [s]."""
-        steering_s = throttle_s = self.command_delay_s
-        for effect_id, given in self.effects.items():
-            effect = EFFECTS[effect_id]
-            if isinstance(effect, DelayEffect):
-                extra_steering_s, extra_throttle_s = effect.extra_delays_s(given)
-                steering_s += extra_steering_s
-                throttle_s += extra_throttle_s
-        return steering_s, throttle_s
+        return delays_s(self.command_delay_s, self.values(), self.effects)
 
     def latency_s(self) -> float:
         """Latency of motion capture with all effects [s]."""

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 from sim_backends.array_ops import Ops, Value
-from sim_backends.effects import EFFECTS, DelayEffect, ObservationEffect
+from sim_backends.effects import EFFECTS, ObservationEffect, delays_s
 from sim_backends.effects.base import Parameters
 from sim_backends.effects.first_order import LagWeights, lag_weights
 
@@ -195,17 +195,11 @@ def velocity_curvature(ops: Ops, before: State, now: State, after: State, period
 def delay_as_recorded_s(ops: Ops, values: Mapping[str, Value], effects: Iterable[str], latency_s: Value) -> Value:
     """The ``timing.command_delay`` [s] relative to a recording, () or (cars,).
 
-    Measured states are old by the latency [s], so commands act later by it.
-
-    It is raised if its sum with the delay effects would be negative.
+    Measured states are old by the latency [s], so commands act later by it. It is raised if its sum with the
+    delay effects would be negative.
     """
     base = values[COMMAND_DELAY] + latency_s
-    extras: list[Value] = [0.0, 0.0]
-    for effect in (EFFECTS[name] for name in effects):
-        if isinstance(effect, DelayEffect):
-            own = effect.numbers(values)
-            extras = [a + b for a, b in zip(extras, effect.extra_delays_s(own), strict=True)]
-    for extra in extras:
+    for extra in delays_s(0.0, values, effects):
         negative = base + extra < 0.0
         if isinstance(negative, bool):  # both are floats
             base = -extra if negative else base

@@ -12,7 +12,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.core.tables import check_keys
 from sim_backends.batch.schedule import Number
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS, DelayEffect
+from sim_backends.effects import delays_s
 from sim_backends.registry import REGISTRY
 
 
@@ -45,15 +45,7 @@ def number_if_shared(value: Number) -> Number:
 
 def total_delays_s(numbers: Mapping[str, Number], effects: Iterable[str]) -> tuple[Number, Number]:
     """Total delay of steering and of throttle with all effects [s]. Raises ConfigError if it is negative."""
-    steering = throttle = numbers["timing.command_delay"]
-    for effect in (EFFECTS[name] for name in effects):
-        if isinstance(effect, DelayEffect):
-            own = effect.numbers(numbers)
-            extra_steering, extra_throttle = effect.extra_delays_s(own)
-            if steering is throttle and extra_steering is extra_throttle:  # equal delays stay the same object
-                steering = throttle = steering + extra_steering
-            else:
-                steering, throttle = steering + extra_steering, throttle + extra_throttle
+    steering, throttle = delays_s(numbers["timing.command_delay"], numbers, effects)
     for channel, delay in (("steering", steering), ("throttle", throttle)):
         if bool((delay < 0).any()) if isinstance(delay, torch.Tensor) else delay < 0:
             raise ConfigError(f"The total delay of {channel} is less than 0 s; raise command_delay.")

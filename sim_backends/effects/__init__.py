@@ -12,6 +12,9 @@ velocity filter, latency). Within a group: by ``order``, then by id.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+
+from sim_backends.array_ops import Value
 from sim_backends.effects.base import (
     ActuatorEffect,
     Confusable,
@@ -105,6 +108,24 @@ def separation(one: str, other: str) -> Confusable | None:
     return None
 
 
+def delays_s(base_s: Value, values: Mapping[str, Value], effects: Iterable[str]) -> tuple[Value, Value]:
+    """Delays of steering and of throttle with all delay effects [s]; the same object if they are equal by definition.
+
+    Args:
+        base_s: delay of both without effects [s], () or (cars,).
+        values: numbers by dotted name.
+        effects: ids of effects; those of class DelayEffect are used.
+    """
+    steering_s = throttle_s = base_s
+    for effect in (EFFECTS[name] for name in effects):
+        if isinstance(effect, DelayEffect):
+            extra_steering_s, extra_throttle_s = effect.extra_delays_s(effect.numbers(values))
+            is_same = steering_s is throttle_s and extra_steering_s is extra_throttle_s
+            steering_s = steering_s + extra_steering_s
+            throttle_s = steering_s if is_same else throttle_s + extra_throttle_s
+    return steering_s, throttle_s
+
+
 def confusable_effects() -> dict[str, tuple[str, ...]]:
     """Confusable effects of each effect of the catalogue; symmetric, in the catalogue's order."""
     pairs = {(e.id, entry.effect) for e in CATALOGUE.values() for entry in e.confusable}
@@ -129,5 +150,6 @@ __all__ = [
     "MeasuredCurve",
     "ObservationEffect",
     "confusable_effects",
+    "delays_s",
     "separation",
 ]
