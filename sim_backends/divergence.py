@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import CarState
 
-
-@dataclass(frozen=True, slots=True)
-class DivergenceLimits:
-    """Limits beyond which a simulated state is not physical.
-
-    Attributes:
-        max_speed_mps: 100 m/s; the fastest remote-controlled cars reach about 90 m/s.
-        max_yaw_rate_radps: 200 rad/s, or 32 turns a second; spinning model cars reach about 30 rad/s.
-    """
-
-    max_speed_mps: float = 100.0
-    max_yaw_rate_radps: float = 200.0
+MAX_SPEED_MPS = 100.0
+"""Speed beyond which a simulation has diverged; the fastest remote-controlled cars reach about 90 m/s."""
+MAX_YAW_RATE_RADPS = 200.0
+"""32 turns a second; spinning model cars reach about 30 rad/s."""
 
 
 def diverged(car: str) -> ConfigError:
@@ -30,10 +22,10 @@ def diverged(car: str) -> ConfigError:
     )
 
 
-def is_physical(state: CarState, limits: DivergenceLimits) -> bool:
+def is_physical(state: CarState) -> bool:
     """Whether a state is finite and within the limits."""
     return (
         all(map(math.isfinite, astuple(state)))
-        and state.speed_mps <= limits.max_speed_mps
-        and abs(state.yaw_rate_radps) <= limits.max_yaw_rate_radps
+        and state.speed_mps <= MAX_SPEED_MPS
+        and abs(state.yaw_rate_radps) <= MAX_YAW_RATE_RADPS
     )

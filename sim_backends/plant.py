@@ -44,12 +44,9 @@ class Plant:
 
     Args:
         config: The car.
-        seed: For plants with random physics; the base model and its effects have none.
     """
 
-    def __init__(self, config: SimulatorConfig, seed: int = 0) -> None:
-        self.config = config
-        self.seed = seed
+    def __init__(self, config: SimulatorConfig) -> None:
         values = config.values()
         self._model = SingleTrack(FLOATS, config.kind, values, config.effects)
         self._chain = ActuatorChain(FLOATS, values, config.effects)

@@ -13,12 +13,10 @@ from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Heal
 from carlab.core.state_estimator import StateEstimator
 from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.divergence import DivergenceLimits, diverged, is_physical
+from sim_backends.divergence import diverged, is_physical
 from sim_backends.measurement import MeasurementModel, State, filter_step
 from sim_backends.plant import Plant, Pose
 from sim_backends.sensor import MocapSensor
-
-DIVERGENCE_LIMITS = DivergenceLimits()
 
 
 class _Approach:
@@ -81,7 +79,7 @@ class SimulatedCar(Car):
         self.watchdog_s = watchdog_s
         self._extra_command_latency_s = extra_command_latency_s
         self._start = CarState() if start is None else start
-        self._plant = Plant(self.config, seed)
+        self._plant = Plant(self.config)
         self._sensor = MocapSensor(self.config, seed, extra_latency_s=extra_pose_latency_s)
         self._estimator = StateEstimator(window_s)
         self._velocities = _MeasuredVelocities(self.config)
@@ -243,7 +241,7 @@ class SimulatedCar(Car):
             if isinstance(error, CarlabError):
                 raise
             raise diverged(self.name) from error
-        if not is_physical(state, DIVERGENCE_LIMITS):
+        if not is_physical(state):
             raise diverged(self.name)
         self._take_in(samples)
 

@@ -73,7 +73,7 @@ class World:
         self.calibration = ActuatorCalibration()
         self.log = CommandLog(Path(config.log) if config.log else None)
         self._lock = threading.Lock()
-        self._plant = Plant(simulator, config.seed)
+        self._plant = Plant(simulator)
         self._sensor = MocapSensor(simulator, config.seed)
         self._command = Action()
         firmware = VescFirmware(

@@ -10,12 +10,12 @@ import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
 
-from sim_backends.array_ops import Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.compiled.machine_code import (
     FloatRow,
     MachineCode,
@@ -75,7 +75,7 @@ class Graph:
 def trace_step(key: Key) -> Graph:
     """Trace one step: carried are the state of the car, of its actuators, and the filtered velocities if any."""
     tracer = Tracer()
-    ops = tracer.as_ops()
+    ops = cast(Ops, tracer)
     ids = [effect.id for effect in key.effects]
     names = [n for n in REGISTRY if not n.startswith("effects.") or n.split(".")[1] in ids]
     values = {name: tracer.input(name) for name in names}

@@ -10,9 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
-
-from sim_backends.array_ops import Ops
+from typing import Any
 
 
 @dataclass(eq=False, slots=True)
@@ -86,11 +84,7 @@ _FOLD: dict[str, Callable[..., float]] = {
     "minimum": min,
     "where": lambda c, a, b: a if c else b,
 }
-
-
-def fold(operation: str, *arguments: float) -> float:
-    """An operation on plain numbers."""
-    return _FOLD[operation](*arguments)
+"""Operations on plain numbers."""
 
 
 @dataclass(eq=False, slots=True)
@@ -99,10 +93,6 @@ class Tracer:
 
     nodes: list[Node] = field(default_factory=list)
     _known: dict[tuple[Any, ...], Node] = field(default_factory=dict)
-
-    def as_ops(self) -> Ops:
-        """This tracer, typed as ``Ops``."""
-        return cast(Ops, self)
 
     def input(self, name: str) -> Node:
         """A new input."""
@@ -113,7 +103,7 @@ class Tracer:
     def make(self, operation: str, *arguments: Any) -> Any:
         """The node of an operation: an existing equal node, or a number if all arguments are numbers."""
         if not any(isinstance(a, Node) for a in arguments):
-            return fold(operation, *arguments)
+            return _FOLD[operation](*arguments)
         if (same := _neutral(operation, arguments)) is not None:
             return same
         if operation in ("add", "mul"):

@@ -108,9 +108,7 @@ class VectorWriter:
 
     def fma(self, a: Name, b: Name, c: Name) -> Name:
         """``a * b + c``, fused where the processor can."""
-        kind = f"v{self.lanes}f{self.bits}"
-        arguments = ", ".join(f"{self.type} {x}" for x in (a, b, c))
-        return self.write(f"call {self.type} @llvm.fmuladd.{kind}({arguments})")
+        return self._call("fmuladd", a, b, c)
 
     def _call(self, function: str, *arguments: Name) -> Name:
         kind = f"v{self.lanes}f{self.bits}"

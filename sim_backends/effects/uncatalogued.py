@@ -79,10 +79,7 @@ class _SideForce(DynamicsEffect):
     catalogued = False
     order = 80
     parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
-    confusable = (
-        Confusable("steering_offset"),
-        Confusable("lateral_bias"),
-    )
+    confusable = (Confusable("steering_offset"), Confusable("lateral_bias"))
 
     @staticmethod
     def push(ops: Ops, forces: Forces, values: Parameters) -> Value:
@@ -94,10 +91,6 @@ class FrontSideForce(_SideForce):
     """``F_y,front += force tanh(|vx| / 0.2 m/s)`` in the front wheels' frame: toe or camber of the front wheels."""
 
     id = "front_side_force"
-    confusable = (
-        Confusable("steering_offset"),
-        Confusable("lateral_bias"),
-    )
     summary = "Toe or camber of the front wheels pushes them to one side."
     class_statement = "constant: a bias of the front wheels' side force, even in steering, as by toe or camber"
 
@@ -110,10 +103,6 @@ class RearSideForce(_SideForce):
     """``F_y,rear += force tanh(|vx| / 0.2 m/s)``: toe or camber of the rear wheels."""
 
     id = "rear_side_force"
-    confusable = (
-        Confusable("steering_offset"),
-        Confusable("lateral_bias"),
-    )
     summary = "Toe or camber of the rear wheels pushes them to one side."
     class_statement = "constant: a bias of the rear wheels' side force, even in steering, as by toe or camber"
 
@@ -167,10 +156,7 @@ class CoastBrake(DynamicsEffect):
     summary = "The motor brakes while the throttle is released."
     class_statement = "odd in speed where there is no throttle, as with a motor that brakes while the car coasts"
     parameters = (EffectParameter("coefficient", "N s/m", 0.0, 0.0, 50.0, 0.5),)
-    confusable = (
-        Confusable("rolling_resistance"),
-        Confusable("throttle_deadband"),
-    )
+    confusable = (Confusable("rolling_resistance"), Confusable("throttle_deadband"))
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Subtract the braking force."""

@@ -76,7 +76,7 @@ def drive_of(simulator: SimulatorConfig, seconds: float = 25.0, seed: int = 1) -
     from sim_backends.plant import Plant
 
     chirp = steering_chirp(duration_s=seconds, high_hz=2.0)
-    plant = Plant(simulator, seed)
+    plant = Plant(simulator)
     plant.reset(CarState(), 0.0)
     period_s = simulator.control_period_s
     times, states, sent = [], [], []

@@ -17,7 +17,7 @@ from carlab.core.errors import (
 )
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Reality
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
-from sim_backends.divergence import DivergenceLimits, is_physical
+from sim_backends.divergence import MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, is_physical
 from sim_backends.simulated_car import SimulatedCar
 
 QUIET = MocapParameters(position_std_m=0.0, yaw_std_rad=0.0)
@@ -136,13 +136,12 @@ def test_diverging_simulation_is_an_error_of_the_car_file(damping_nspm):
 
 
 def test_state_at_the_limits_of_speed_and_yaw_rate_is_physical():
-    limits = DivergenceLimits()
-    fast = CarState(vx_mps=limits.max_speed_mps, yaw_rate_radps=-limits.max_yaw_rate_radps)
-    assert is_physical(fast, limits)
-    assert not is_physical(replace(fast, vy_mps=10.0), limits)
-    assert not is_physical(replace(fast, yaw_rate_radps=-limits.max_yaw_rate_radps - 1.0), limits)
-    assert not is_physical(CarState(x_m=math.inf), limits)
-    assert not is_physical(CarState(yaw_rad=math.nan), limits)
+    fast = CarState(vx_mps=MAX_SPEED_MPS, yaw_rate_radps=-MAX_YAW_RATE_RADPS)
+    assert is_physical(fast)
+    assert not is_physical(replace(fast, vy_mps=10.0))
+    assert not is_physical(replace(fast, yaw_rate_radps=-MAX_YAW_RATE_RADPS - 1.0))
+    assert not is_physical(CarState(x_m=math.inf))
+    assert not is_physical(CarState(yaw_rad=math.nan))
 
 
 def test_watchdog_replaces_an_old_command_by_neutral():
