@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -29,22 +29,22 @@ class LearnRequest:
     """The arguments of ``learn``, with the defaults of a new run.
 
     Attributes:
-        given: names of the arguments that the caller gives, among those that a resumed run cannot change.
+        given: names of the arguments that the caller gives.
     """
 
     car: str | Path | CarFile
-    episodes: int | None
-    device: Device | None
-    resume: Path | None
     live: bool
-    viewer: str | None
-    vehicle: str | Path | CarFile | None
-    reality: str | Path | CarFile | None
     dry_run: bool
-    task: str | Task | None
-    track: Path | str | None
     ray: str
     ray_wait: float
+    episodes: int | None = None
+    device: Device | None = None
+    resume: Path | None = None
+    viewer: str | None = None
+    vehicle: str | Path | CarFile | None = None
+    reality: str | Path | CarFile | None = None
+    task: str | Task | None = None
+    track: Path | str | None = None
     ticks: int | None = None
     prior: str | Path | CarFile = "kinematic"
     method: Method = "gp-sim-posterior"
@@ -54,9 +54,9 @@ class LearnRequest:
     seed: int = 0
     place: bool = True
     rerun: bool = True
-    out: Path = Path("runs")
+    out: Path | str = "runs"
     name: str = "learn"
-    given: frozenset[str] = field(default=frozenset())
+    given: frozenset[str]
 
     @property
     def car_options(self) -> str:

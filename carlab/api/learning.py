@@ -180,17 +180,12 @@ def learn(
         ConfigError, DataError: an argument is invalid or differs from the run to resume, or training failed.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
-    options: dict[str, Any] = {
-        "ticks": ticks, "prior": prior, "method": None if method is None else current_method(method),
-        "history": history, "model_steps": model_steps, "updates": updates, "seed": seed, "place": place,
-        "out": None if out is None else Path(out), "name": name, "rerun": rerun,
-    }  # fmt: skip
-    given = {option: value for option, value in options.items() if value is not None}
-    return _learn(LearnRequest(
-        car=car, task=task, track=track, episodes=episodes, device=device,
-        resume=None if resume is None else Path(resume), live=live, viewer=viewer, vehicle=vehicle, reality=reality,
-        dry_run=dry_run, ray=ray, ray_wait=ray_wait, **given, given=frozenset(given),
-    ), hooks or LearnHooks())  # fmt: skip
+    given: dict[str, Any] = {name: value for name, value in locals().items() if value is not None and name != "hooks"}
+    if resume is not None:
+        given["resume"] = Path(resume)
+    if method is not None:
+        given["method"] = current_method(method)
+    return _learn(LearnRequest(**given, given=frozenset(given)), hooks or LearnHooks())
 
 
 @dataclass(slots=True)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from carlab.cli.bench_output import command, write_figures
 from carlab.cli.bench_priors import recordings_in
-from carlab.cli.console import console, fail, progress, table
+from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
+from carlab.cli.runs import search_callbacks
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,15 +20,13 @@ def run_realcars(options: BenchOptions) -> int:
     """Diagnose the recordings to fit, and print the errors of all models on the held-out recordings."""
     from carlab.api import diagnose
     from carlab.diagnosis.report.events import diagnosed_event_sentences
-    from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.studies.real_cars import as_json, real_car_errors, split_by_name
 
     if options.data is None:
         raise ConfigError("bench realcars needs --data FOLDER with recordings of one car; add it.")
     files = {path.name: path for path in recordings_in(options.data)}
     fit, held_out = split_by_name(list(files), options.held_out, options.fit)
-    with Interrupts(second_raises=True) as interrupts, progress() as bar:
-        row = bar.add_task("diagnosis", total=100, note="")
+    with search_callbacks("diagnosis") as callbacks:
         report = diagnose(
             [files[name] for name in fit],
             options.car,
@@ -39,8 +38,7 @@ def run_realcars(options: BenchOptions) -> int:
             adapt=True,
             keep_events=options.keep_events,
             out=None if options.out is None else options.out.with_suffix(""),
-            progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
-            stop=interrupts.requested.is_set,
+            **callbacks,
         )
     if report.outcome is None:
         fail(report.sentence)

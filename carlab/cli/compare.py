@@ -8,9 +8,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from carlab.cli.console import console, fail, progress
+from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import arguments_of, report_folder
+from carlab.cli.runs import search_callbacks
 
 
 @dataclass
@@ -45,16 +46,10 @@ class Compare:
     def run(self) -> int:
         """Compare and print the changes."""
         from carlab.api import compare
-        from carlab.experiment.episodes.interrupts import Interrupts
 
         report_folder(self.out)
-        with Interrupts(second_raises=True) as interrupts, progress() as bar:
-            row = bar.add_task("comparison", total=100, note="")
-            found = compare(
-                **arguments_of(self, compare),
-                progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
-                stop=interrupts.requested.is_set,
-            )
+        with search_callbacks("comparison") as callbacks:
+            found = compare(**arguments_of(self, compare), **callbacks)
         if found.verdict == "inconclusive":
             fail(found.sentence)
             return EXIT_INCONCLUSIVE

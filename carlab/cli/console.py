@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 
 from rich import box
 from rich.console import Console
@@ -107,27 +106,22 @@ def readings_table(title: str, readings: Mapping[str, float]) -> None:
     table(title, ["reading", "value", "unit"], rows)
 
 
-@contextmanager
-def progress(speed_estimate_period_s: float = 30.0) -> Iterator[Progress]:
+def progress(speed_estimate_period_s: float = 30.0) -> Progress:
     """A progress bar on a terminal; it is disabled if the output is a file.
 
     The remaining time is estimated from the steps of the last ``speed_estimate_period_s``.
     """
-    columns = (
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
-    )
-    with Progress(
-        *columns,
         console=console,
         transient=True,
         disable=not sys.stdout.isatty(),
         speed_estimate_period=speed_estimate_period_s,
-    ) as bar:
-        yield bar
+    )
 
 
 def log_to_console(*, verbose: bool) -> None:

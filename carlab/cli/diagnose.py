@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from carlab.cli.console import console, fail, progress
+from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import arguments_of, report_folder
 from carlab.cli.recordings import print_errors
+from carlab.cli.runs import search_callbacks
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import Diagnosis
@@ -85,16 +86,10 @@ class Diagnose:
     def run(self) -> int:
         """Diagnose and print the verdict."""
         from carlab.api import diagnose
-        from carlab.experiment.episodes.interrupts import Interrupts
 
         report_folder(self.out)
-        with Interrupts(second_raises=True) as interrupts, progress() as bar:
-            row = bar.add_task("diagnosis", total=100, note="")
-            report = diagnose(
-                **arguments_of(self, diagnose),
-                progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
-                stop=interrupts.requested.is_set,
-            )
+        with search_callbacks("diagnosis") as callbacks:
+            report = diagnose(**arguments_of(self, diagnose), **callbacks)
         if not report.is_conclusive:
             fail(report.sentence)
             return 0 if report.verdict == "data" else EXIT_INCONCLUSIVE

@@ -76,16 +76,14 @@ class Emulate:
         with Interrupts() as interrupts, World(config) as world:
             addresses = world.addresses
             console.print(Text("EMULATED", "bold"), " Car file for a program on this host:")
-            # Printed without rich's mark-up, which would interpret the square brackets of TOML.
-            lines = ["[hardware.actuator]"]
-            if self.actuator == "serial":
-                lines += ['kind = "vesc_serial"', f'port = "{addresses["port"]}"']
-            else:
-                lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{addresses["can_channel"]}"']
-            lines += ["[hardware.mocap]", 'server_address = "127.0.0.1"', 'local_interface = "127.0.0.1"']
-            lines += [f'mode = "{self.mode}"', f"command_port = {addresses['command_port']}", f'body = "{config.body}"']
-            calibration = tomli_w.dumps({"hardware": {"calibration": asdict(ActuatorCalibration())}}).rstrip()
-            console.print("\n".join([*lines, calibration]), soft_wrap=True)
+            actuator = {"kind": "vesc_serial", "port": addresses["port"]}
+            if self.actuator == "can":
+                channel = addresses["can_channel"]
+                actuator = {"kind": "vesc_can", "interface": "udp_multicast", "channel": channel}
+            mocap = {"server_address": "127.0.0.1", "local_interface": "127.0.0.1", "mode": self.mode}
+            mocap |= {"command_port": addresses["command_port"], "body": config.body}
+            hardware = {"actuator": actuator, "mocap": mocap, "calibration": asdict(ActuatorCalibration())}
+            console.print(tomli_w.dumps({"hardware": hardware}).rstrip(), soft_wrap=True)
             console.print("^C ends it.")
             while not interrupts.requested.wait(0.2):
                 pass

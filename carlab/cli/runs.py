@@ -1,15 +1,16 @@
-"""Callbacks of runs that several verbs share, and figures of tasks in tables."""
+"""Callbacks of runs and searches that several verbs share, and figures of tasks in tables."""
 
 from __future__ import annotations
 
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from carlab.cli.console import banner, console, fail
+from carlab.cli.console import banner, console, fail, progress
 from carlab.cli.exit_codes import EXIT_SAFETY_STOP
 from carlab.core.errors import ConfigError
 
@@ -58,6 +59,19 @@ def common_hooks(bar: Progress) -> dict[str, Any]:
 
     place_by_hand = ask_to_place(bar, "use --no-place or a terminal")
     return {"on_start": on_start, "place_by_hand": place_by_hand, "on_abandon": on_abandon}
+
+
+@contextmanager
+def search_callbacks(name: str) -> Iterator[dict[str, Any]]:
+    """Callbacks ``progress`` and ``stop`` of a search: a bar in percent, and ^C. A second ^C ends the program."""
+    from carlab.experiment.episodes.interrupts import Interrupts
+
+    with Interrupts(second_raises=True) as interrupts, progress() as bar:
+        row = bar.add_task(name, total=100, note="")
+        yield {
+            "progress": lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
+            "stop": interrupts.requested.is_set,
+        }
 
 
 def heading(name: str) -> str:
