@@ -18,6 +18,7 @@ from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import Recording, body_velocity, window_rows
 from carlab.benchmark.world.simulation import FloatArray
 from carlab.core.errors import DataError
+from carlab.core.planar import to_world
 
 STEP_S = 0.3
 EVERY_S = 0.15
@@ -212,9 +213,7 @@ def held_out_score(
         state = steps.ends.copy()
         state[:, 3:] += gained
         moved = 0.5 * steps.length_s * gained
-        cos, sin = np.cos(state[:, 2]), np.sin(state[:, 2])
-        state[:, 0] += cos * moved[:, 0] - sin * moved[:, 1]
-        state[:, 1] += sin * moved[:, 0] + cos * moved[:, 1]
+        state[:, :2] += np.stack(to_world(moved[:, 0], moved[:, 1], state[:, 2]), axis=1)
         state[:, 2] += moved[:, 2]
     if at_end is not None:
         state[:, 3:] += at_end(steps)

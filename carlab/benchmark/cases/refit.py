@@ -15,6 +15,7 @@ import numpy as np
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.measurement import Recording, local_fit, to_body
 from carlab.benchmark.world.simulation import FloatArray
+from carlab.core import planar
 
 HORIZON_S = 1.0
 PRIOR_SHARE = 0.15
@@ -123,11 +124,7 @@ def cut_windows(
 
 def in_start_frame(errors: FloatArray, starts: FloatArray) -> FloatArray:
     """Errors (M, 6) with x, y rotated into the body frame of each initial state."""
-    cos, sin = np.cos(starts[:, 2]), np.sin(starts[:, 2])
-    turned = errors.copy()
-    turned[:, 0] = cos * errors[:, 0] + sin * errors[:, 1]
-    turned[:, 1] = cos * errors[:, 1] - sin * errors[:, 0]
-    return turned
+    return np.stack([*planar.to_body(errors[:, 0], errors[:, 1], starts[:, 2]), *errors[:, 2:].T], axis=1)
 
 
 def channel_scores(windows: Windows, values: Mapping[str, float], floor: FloatArray | None = None) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import body_velocity, window_rows, wrapped
 from carlab.benchmark.world.simulation import FloatArray
+from carlab.core.planar import to_world
 
 Table = dict[str, FloatArray]
 Faulty = tuple[Table, tuple[str, ...], int]
@@ -97,8 +98,7 @@ def wrong_sign(table: Table, rng: np.random.Generator, car: BaseCar) -> Faulty:
 
 def wrong_frame(table: Table, rng: np.random.Generator, car: BaseCar) -> Faulty:
     """Velocities in the world frame."""
-    cos, sin = np.cos(table["yaw"]), np.sin(table["yaw"])
-    vx, vy = cos * table["vx"] - sin * table["vy"], sin * table["vx"] + cos * table["vy"]
+    vx, vy = to_world(table["vx"], table["vy"], table["yaw"])
     return {**table, "vx": vx, "vy": vy}, ("vx", "vy"), len(table["t"])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from carlab.benchmark.effects.catalogue import Form, Parameters, plain, signed
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import FloatArray
+from carlab.core.planar import to_world
 
 
 def mocap_latency(world: World, p: Parameters) -> None:
@@ -21,10 +22,8 @@ def marker_offset(world: World, p: Parameters) -> None:
     ahead, left = p["ahead"], p["left"]
 
     def move(t: FloatArray, pose: FloatArray) -> FloatArray:
-        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         moved = pose.copy()
-        moved[:, 0] += cos * ahead - sin * left
-        moved[:, 1] += sin * ahead + cos * left
+        moved[:, :2] += np.stack(to_world(ahead, left, pose[:, 2]), axis=1)
         return moved
 
     world.pose_changes.append(move)

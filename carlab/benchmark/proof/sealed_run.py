@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import secrets
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ Progress = Callable[[str, int, int, str], None]
 LOCAL = LocalExecutor()
 
 
+@dataclass
 class SealedRun:
     """Folder with ``seal.json``, ``handed/NAME/`` (input of the tool) and ``answers/`` (not accessible to the tool).
 
-    Args:
+    Attributes:
         root: Folder; created if missing.
         plan: The cases as JSON; they must equal those of an existing folder.
         progress: Called with stage, done, total and a note.
@@ -32,25 +34,19 @@ class SealedRun:
         executor: Runs the child processes; with more than one job in parallel, each uses one thread.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        plan: Sequence[Mapping[str, Any]],
-        *,
-        progress: Progress = lambda stage, done, total, note: None,
-        timeout_s: float = 1800.0,
-        stop_requested: Callable[[], bool] = lambda: False,
-        abandon: Callable[[], bool] = lambda: False,
-        executor: Executor = LOCAL,
-    ) -> None:
-        self.root = root.absolute()
-        self.progress = progress
-        self.timeout_s = timeout_s
-        self.stop_requested = stop_requested
-        self.abandon = abandon
-        self.executor = executor
+    root: Path
+    plan: Sequence[Mapping[str, Any]]
+    _: KW_ONLY
+    progress: Progress = lambda stage, done, total, note: None
+    timeout_s: float = 1800.0
+    stop_requested: Callable[[], bool] = lambda: False
+    abandon: Callable[[], bool] = lambda: False
+    executor: Executor = LOCAL
+
+    def __post_init__(self) -> None:
+        self.root = self.root.absolute()
         self.answers_folder = self.root / "answers"
-        self._plan = json.loads(json.dumps(list(plan)))
+        self.plan = json.loads(json.dumps(list(self.plan)))  # as it is read from plan.json
 
     @property
     def environment(self) -> Mapping[str, str]:
@@ -64,9 +60,9 @@ class SealedRun:
             foreign = [p.name for p in self.root.iterdir() if p.suffix != ".toml"] if self.root.is_dir() else []
             if foreign:
                 raise DataError(f"{self.root} contains other files ({foreign[0]}); name a new folder for the proof.")
-            write_json(path, {"plan": self._plan, "names": [secrets.token_hex(8) for _ in self._plan]})
+            write_json(path, {"plan": self.plan, "names": [secrets.token_hex(8) for _ in self.plan]})
         stored = read_json(path)
-        if stored["plan"] != self._plan:
+        if stored["plan"] != self.plan:
             raise DataError(
                 f"{self.root} contains a proof of other cases or files; use the same ones or another folder."
             )

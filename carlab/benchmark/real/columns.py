@@ -14,6 +14,7 @@ from carlab.benchmark.effects.data_faults import Table
 from carlab.benchmark.effects.observation_forms import ramp_filter
 from carlab.benchmark.world.measurement import local_fit, wrapped
 from carlab.benchmark.world.simulation import FloatArray
+from carlab.core.planar import to_world
 
 ZERO_COMMAND = 0.002  # share of full command below which a command counts as zero
 SPIKE_RADPS = 1.0  # a yaw rate this far from the slope of the yaw is a spike of its estimator
@@ -67,11 +68,11 @@ def before_saturation(command: FloatArray, saturation: float) -> FloatArray:
 def moved_point(table: Table, ahead_m: float, left_m: float) -> Table:
     """Track another point of the body: p + R(yaw) [ahead, left], with the velocity of that point."""
     rate = yaw_rate_without_spikes(table)
-    cos, sin = np.cos(table["yaw"]), np.sin(table["yaw"])
+    x, y = to_world(ahead_m, left_m, table["yaw"])
     return {
         **table,
-        "x": table["x"] + cos * ahead_m - sin * left_m,
-        "y": table["y"] + sin * ahead_m + cos * left_m,
+        "x": table["x"] + x,
+        "y": table["y"] + y,
         "vx": table["vx"] - left_m * rate,
         "vy": table["vy"] + ahead_m * rate,
     }

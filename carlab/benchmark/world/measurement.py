@@ -11,6 +11,7 @@ from scipy.signal import savgol_filter
 
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, FloatArray
+from carlab.core import planar
 
 COLUMNS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
 
@@ -79,8 +80,7 @@ def local_fit(values: FloatArray, window: int, order: int, gap_s: float) -> tupl
 
 def to_body(yaw: FloatArray, slope: FloatArray) -> FloatArray:
     """World rates of (x, y, yaw), (N, 3), as vx, vy, yaw_rate in the body frame."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([cos * slope[:, 0] + sin * slope[:, 1], cos * slope[:, 1] - sin * slope[:, 0], slope[:, 2]], axis=1)
+    return np.stack([*planar.to_body(slope[:, 0], slope[:, 1], yaw), slope[:, 2]], axis=1)
 
 
 def body_velocity(pose: FloatArray, gap_s: float, window: int) -> FloatArray:
