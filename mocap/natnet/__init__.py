@@ -1,1 +1,1 @@
-"""The NatNet protocol: codec (pure), sockets, discovery and client."""
+"""The NatNet protocol: codec (pure) and sockets."""

@@ -1,4 +1,4 @@
-"""Error messages and closing of client and server; configuration and discovery."""
+"""Error messages and closing of client and server, and the configuration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from carlab.core.errors import ConfigError, NotOpenError, NotReadyError
 from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
-from mocap.natnet.discovery import discover
 from mocap.natnet.models import BitstreamVersion
 from mocap.natnet_client import NatNetClient
 
@@ -139,18 +138,3 @@ def test_invalid_server_options_are_refused(options: dict[str, Any], message: st
 def test_invalid_configurations_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         MocapConfig(**options)
-
-
-# -- discovery ------------------------------------------------------------------------------------------------------
-
-
-def test_discovery_finds_the_server(serve: Serve) -> None:
-    server = serve(mode="multicast", version="4.0")
-    (found,) = discover("127.0.0.1", command_port=server.command_port, timeout_s=1.0)
-    assert found.address == "127.0.0.1"
-    assert (found.info.name, found.info.bitstream, found.info.data_port) == ("carlab emulator", V40, server.data_port)
-    assert found.info.is_multicast
-    server.faults = ServerFaults(no_answers=True)
-    assert discover("127.0.0.1", command_port=server.command_port, timeout_s=0.1) == ()
-    with pytest.raises(NotReadyError, match="network"):
-        discover("no-such-host.invalid")
