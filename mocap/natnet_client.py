@@ -16,24 +16,19 @@ from typing import Self
 
 from carlab.core.errors import ProtocolError
 from mocap.config import MocapConfig
+from mocap.natnet import messages
 from mocap.natnet.bitstream_switch import BitstreamSwitch
-from mocap.natnet.codec import (
+from mocap.natnet.message_schedule import MessageSchedule
+from mocap.natnet.models import (
+    FRAME_MODELS_CHANGED,
+    FRAME_RECORDING,
     BitstreamVersion,
+    Description,
     Frame,
     MessageId,
-    Response,
-    ServerInfo,
-    decode_echo_response,
-    decode_server_info,
-    decode_text,
-    encode_connect,
-    encode_echo_request,
-    encode_message,
-    encode_request,
-    split_message,
+    ServerMode,
+    check_readable,
 )
-from mocap.natnet.message_schedule import MessageSchedule
-from mocap.natnet.models import FRAME_MODELS_CHANGED, FRAME_RECORDING, Description, ServerMode, check_readable
 from mocap.natnet.sockets import (
     DATAGRAM_BYTES,
     DEFAULT_DATA_PORT,
@@ -69,7 +64,7 @@ class NatNetClient:
         on_models: Callable[[tuple[Description, ...]], None] | None = None,
     ) -> None:
         self.config = config
-        self.server_info: ServerInfo | None = None
+        self.server_info: messages.ServerInfo | None = None
         self.models: tuple[Description, ...] | None = None
         self.server_mode: int | None = None
         self.alignment = ClockAlignment(0.0)
@@ -78,7 +73,7 @@ class NatNetClient:
         self._changed = threading.Condition()
         self._statistics = StreamStatistics()
         self._decoder: BitstreamSwitch | None = None
-        self._responses: list[Response | None] = []
+        self._responses: list[messages.Response | None] = []
         self._polls_mode = self._is_recording = False
         self._server = ""
         self._command: socket.socket | None = None
@@ -142,14 +137,14 @@ class NatNetClient:
             # The thread sends the echoes; without answers, capture times are times of arrival.
             self._wait(lambda: self.alignment.echoes >= MIN_ECHOES, config.timeout_s)
 
-    def _agree_on_bitstream(self, info: ServerInfo) -> None:
+    def _agree_on_bitstream(self, info: messages.ServerInfo) -> None:
         """Request the version from a unicast server of NatNet 4 or later; until it takes effect both are decoded."""
         decoder, wanted = self._decoder, self.config.bitstream_version
         assert decoder is not None
         if self._wants_other_bitstream(info):
             self._responses.clear()
             decoder.pending = wanted
-            request = encode_request(f"Bitstream,{wanted}")
+            request = messages.encode_request(f"Bitstream,{wanted}")
             answered = self._send_until(MessageId.REQUEST, request, lambda: bool(self._responses))
             response = self._responses[0] if answered else None
             if response is not None and len(response.data) == 4 and response.as_int() == 0:
@@ -229,7 +224,7 @@ class NatNetClient:
 
     def _connect_payload(self) -> bytes:
         wanted = self.config.bitstream_version if self.config.mode == "unicast" else None
-        return encode_connect("carlab", bitstream=wanted)
+        return messages.encode_connect("carlab", bitstream=wanted)
 
     def _send_until(
         self, message_id: int, payload: bytes, answered: Callable[[], bool], timeout_s: float | None = None
@@ -254,7 +249,7 @@ class NatNetClient:
         if self._command is None:
             return
         try:
-            self._command.sendto(encode_message(message_id, payload), (self._server, self.config.command_port))
+            self._command.sendto(messages.encode_message(message_id, payload), (self._server, self.config.command_port))
         except OSError as error:  # the network may be down briefly; missing frames are reported elsewhere
             with self._changed:
                 self._statistics.last_error = f"sending to {self._server} failed: {error}"
@@ -295,7 +290,7 @@ class NatNetClient:
                 self._statistics.foreign_address = source[0]
             return
         try:
-            message_id, payload = split_message(datagram)
+            message_id, payload = messages.split_message(datagram)
             if message_id == MessageId.FRAMEOFDATA:
                 self._handle_frame(payload, received_s)
             else:
@@ -309,22 +304,22 @@ class NatNetClient:
         models: tuple[Description, ...] | None = None
         with self._changed:
             if message_id == MessageId.SERVERINFO:
-                self._handle_server_info(decode_server_info(payload))
+                self._handle_server_info(messages.decode_server_info(payload))
             elif message_id == MessageId.ECHORESPONSE:
-                stamp, ticks = decode_echo_response(payload)
+                stamp, ticks = messages.decode_echo_response(payload)
                 self.alignment.add_echo(stamp * 1e-9, ticks, received_s)
             elif message_id == MessageId.MODELDEF and self._decoder is not None:
                 models = self.models = self._decoder.decode_models(payload)
                 self._schedule.models_outdated = False
             elif message_id in (MessageId.RESPONSE, MessageId.UNRECOGNIZED_REQUEST):
-                self._handle_response(Response(payload) if message_id == MessageId.RESPONSE else None)
+                self._handle_response(messages.Response(payload) if message_id == MessageId.RESPONSE else None)
             elif message_id == MessageId.MESSAGESTRING:
-                _log.info("Message from the NatNet server: %s", decode_text(payload))
+                _log.info("Message from the NatNet server: %s", messages.decode_text(payload))
             self._changed.notify_all()
         if models is not None and self._on_models is not None:
             self._on_models(models)
 
-    def _handle_server_info(self, info: ServerInfo) -> None:
+    def _handle_server_info(self, info: messages.ServerInfo) -> None:
         """Store the server's information. After a reconnect the server may be a different one."""
         before = self.server_info
         if before == info and not self._schedule.reconnecting:
@@ -338,18 +333,18 @@ class NatNetClient:
             self._schedule.models_outdated = True
             if self._wants_other_bitstream(info):
                 self._decoder.pending = self.config.bitstream_version
-                self._send(MessageId.REQUEST, encode_request(f"Bitstream,{self.config.bitstream}"))
+                self._send(MessageId.REQUEST, messages.encode_request(f"Bitstream,{self.config.bitstream}"))
         if before is None or before.clock_hz != info.clock_hz:
             self.alignment = ClockAlignment(float(info.clock_hz))
 
-    def _handle_response(self, response: Response | None) -> None:
+    def _handle_response(self, response: messages.Response | None) -> None:
         """Store the answer to the request for the mode, or to that for a bitstream version before."""
         if not self._polls_mode:
             self._responses.append(response)
         elif response is not None and len(response.data) == 4:
             self.server_mode = response.as_int()
 
-    def _wants_other_bitstream(self, info: ServerInfo) -> bool:
+    def _wants_other_bitstream(self, info: messages.ServerInfo) -> bool:
         return (
             self.config.mode == "unicast"
             and info.bitstream >= (4, 0)
@@ -389,8 +384,8 @@ class NatNetClient:
         settled = self.alignment.echoes >= MIN_ECHOES and not self.alignment.is_uncertain
         payloads: dict[MessageId, Callable[[], bytes]] = {
             MessageId.CONNECT: self._connect_payload,
-            MessageId.ECHOREQUEST: lambda: encode_echo_request(time.monotonic_ns()),
-            MessageId.REQUEST: lambda: encode_request("CurrentMode"),
+            MessageId.ECHOREQUEST: lambda: messages.encode_echo_request(time.monotonic_ns()),
+            MessageId.REQUEST: lambda: messages.encode_request("CurrentMode"),
         }
         has_clock, polls_mode = self.server_info.clock_hz > 0, self._polls_mode
         for message_id in self._schedule.due(now_s, has_clock=has_clock, settled=settled, polls_mode=polls_mode):

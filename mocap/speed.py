@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 
-from mocap.natnet.codec import Frame, MessageId, decode_frame, encode_frame, encode_message, split_message
-from mocap.natnet.models import BitstreamVersion, LabelledMarker, MarkerSet, RigidBody
+from mocap.natnet.frames import decode_frame, encode_frame
+from mocap.natnet.messages import encode_message, split_message
+from mocap.natnet.models import BitstreamVersion, Frame, LabelledMarker, MarkerSet, MessageId, RigidBody
 
 
 def example_frame(bodies: int, other_markers: int, labelled_markers: int, marker_sets: int = 0) -> Frame:

@@ -21,23 +21,28 @@ from carlab.core.errors import ConfigError, NotOpenError, ProtocolError
 from mocap.config import check_multicast_group
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.scene import EmulatedBody, EmulatedScene, RigidBodySample
-from mocap.natnet.codec import (
-    BitstreamVersion,
-    Frame,
-    MessageId,
+from mocap.natnet.descriptions import encode_model_def
+from mocap.natnet.frames import encode_frame
+from mocap.natnet.messages import (
     ServerInfo,
     decode_connect,
     decode_echo_request,
     decode_text,
     encode_echo_response,
-    encode_frame,
     encode_message,
-    encode_model_def,
     encode_response,
     encode_server_info,
     split_message,
 )
-from mocap.natnet.models import FRAME_BITSTREAM_CHANGED, FRAME_MODELS_CHANGED, NEWEST_BITSTREAM, SERVED_BITSTREAMS
+from mocap.natnet.models import (
+    FRAME_BITSTREAM_CHANGED,
+    FRAME_MODELS_CHANGED,
+    NEWEST_BITSTREAM,
+    SERVED_BITSTREAMS,
+    BitstreamVersion,
+    Frame,
+    MessageId,
+)
 from mocap.natnet.sockets import (
     DATAGRAM_BYTES,
     DEFAULT_COMMAND_PORT,

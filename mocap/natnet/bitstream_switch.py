@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 
 from carlab.core.errors import ProtocolError
-from mocap.natnet.codec import decode_frame, decode_model_def, explain_frame_error
+from mocap.natnet.descriptions import decode_model_def
+from mocap.natnet.frames import decode_frame, explain_frame_error
 from mocap.natnet.models import FRAME_BITSTREAM_CHANGED, BitstreamVersion, Description, Frame, check_readable
 
 _SIZED = BitstreamVersion(4, 1)

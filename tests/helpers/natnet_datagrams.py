@@ -2,19 +2,18 @@
 
 from typing import Any
 
-from mocap.natnet.codec import (
-    BitstreamVersion,
-    MessageId,
+from mocap.natnet.descriptions import decode_model_def
+from mocap.natnet.frames import decode_frame
+from mocap.natnet.messages import (
     Response,
     decode_connect,
     decode_echo_request,
     decode_echo_response,
-    decode_frame,
-    decode_model_def,
     decode_server_info,
     decode_text,
     split_message,
 )
+from mocap.natnet.models import BitstreamVersion, MessageId
 
 
 def decode_datagram(datagram: bytes, version: BitstreamVersion, *, lenient: bool = False) -> tuple[int, Any]:

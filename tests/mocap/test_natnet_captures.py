@@ -13,21 +13,10 @@ from natnet.version import Version
 from natnet_datagrams import decode_datagram
 from scipy.spatial.transform import Rotation
 
-from mocap.natnet.codec import (
-    BitstreamVersion,
-    Connect,
-    Frame,
-    ServerInfo,
-    decode_frame,
-    encode_connect,
-    encode_frame,
-    encode_message,
-    encode_model_def,
-    encode_server_info,
-    layouts_that_fit,
-    split_message,
-)
-from mocap.natnet.models import MarkerSetDescription, RigidBodyDescription
+from mocap.natnet.descriptions import encode_model_def
+from mocap.natnet.frames import decode_frame, encode_frame, layouts_that_fit
+from mocap.natnet.messages import Connect, ServerInfo, encode_connect, encode_message, encode_server_info, split_message
+from mocap.natnet.models import BitstreamVersion, Frame, MarkerSetDescription, RigidBodyDescription
 
 V3 = BitstreamVersion(3, 0)
 CLOCK_HZ = 3312787  # from the captured server info

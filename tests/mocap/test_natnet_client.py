@@ -13,21 +13,15 @@ from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
 from mocap.emulators.scene import EmulatedBody
 from mocap.natnet.bitstream_switch import BitstreamSwitch
-from mocap.natnet.codec import (
-    Frame,
-    MessageId,
-    decode_frame,
-    decode_model_def,
-    encode_connect,
-    encode_frame,
-    encode_message,
-    encode_request,
-    split_message,
-)
+from mocap.natnet.descriptions import decode_model_def
+from mocap.natnet.frames import decode_frame, encode_frame
+from mocap.natnet.messages import encode_connect, encode_message, encode_request, split_message
 from mocap.natnet.models import (
     FRAME_BITSTREAM_CHANGED,
     SERVED_BITSTREAMS,
     BitstreamVersion,
+    Frame,
+    MessageId,
     RigidBody,
     RigidBodyDescription,
 )

@@ -14,30 +14,21 @@ from natnet.version import Version
 from natnet_datagrams import decode_datagram
 
 from carlab.core.errors import ProtocolError
-from mocap.natnet.codec import (
-    BitstreamVersion,
-    Frame,
-    decode_connect,
-    decode_frame,
-    decode_model_def,
-    decode_server_info,
-    encode_connect,
-    encode_frame,
-    encode_message,
-    encode_model_def,
-    explain_frame_error,
-    split_message,
-)
+from mocap.natnet.descriptions import decode_model_def, encode_model_def
+from mocap.natnet.frames import decode_frame, encode_frame, explain_frame_error
+from mocap.natnet.messages import decode_connect, decode_server_info, encode_connect, encode_message, split_message
 from mocap.natnet.models import (
     SERVED_BITSTREAMS,
     AnalogSource,
     Asset,
     AssetDescription,
     AssetMarkerDescription,
+    BitstreamVersion,
     CameraDescription,
     Description,
     DeviceDescription,
     ForcePlateDescription,
+    Frame,
     LabelledMarker,
     MarkerSet,
     MarkerSetDescription,

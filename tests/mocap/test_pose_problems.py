@@ -10,8 +10,7 @@ import pytest
 from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
-from mocap.natnet.codec import MessageId
-from mocap.natnet.models import ServerMode
+from mocap.natnet.models import MessageId, ServerMode
 from mocap.natnet_client import NatNetClient
 from mocap.rigid_body import RigidBodyPoseSource
 
