@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from carlab.benchmark.cases.proof_set import CaseSpec
-from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
+from carlab.benchmark.cases.set_check import COMMAND_EFFECTS, indistinguishable
 from carlab.benchmark.proof.sealed_run import SealedRun
-from carlab.benchmark.proof.worker import FILES, write_json
+from carlab.benchmark.proof.worker import ANSWER, FILES, SCORES, write_json
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
@@ -35,7 +35,6 @@ DIAGNOSE = (PYTHON, "-m", "carlab", "diagnose", "--decisions", "--jobs", "1")
 COMPARED = ("single", "multiple", "null", "parameters", "outside")
 WITH_EFFECTS = ("single", "pair", "multiple")
 WORKER = (PYTHON, "-m", "carlab.benchmark.proof.worker")
-CASE_OUTPUTS = tuple(f"handed/{file}" for file in FILES)
 
 
 class Proof(SealedRun):
@@ -65,13 +64,12 @@ class Proof(SealedRun):
         specs = dict(zip(self.names(), self.specs, strict=True))
 
         def make_one(name: str) -> ChildEnd:
-            order = {"spec": specs[name].as_dict(), "handed": "handed", "answer": "answer.json"}
-            made = self._work("make", order, {}, (*CASE_OUTPUTS, "answer.json"))
+            made = self._work("make", {"spec": specs[name].as_dict()}, {}, (*FILES, ANSWER))
             if not made.end.abandoned:
-                answer = made.outputs["answer.json"]
-                files = {k: v for k, v in made.outputs.items() if k in CASE_OUTPUTS}
+                files = dict(made.outputs)
+                answer = json.loads(files.pop(ANSWER))
                 JobEnd(made.end, files).write_outputs(self.root / "handed" / name)
-                write_json(self.answers_folder / f"{name}.json", json.loads(answer))
+                write_json(self.answers_folder / f"{name}.json", answer)
             return made.end
 
         if not self.stage("make", list(specs), lambda name: (self.answers_folder / f"{name}.json").exists(), make_one):
@@ -108,11 +106,9 @@ class Proof(SealedRun):
 
         def run_one(name: str) -> ChildEnd:
             floor = read_json(self.answers_folder / f"{name}.json")["floor"]
-            scored = self._work(
-                "baselines", {"to": "scores.json", "floor": floor}, self._handed(name), ("scores.json",)
-            )
+            scored = self._work("baselines", {"floor": floor}, self._handed(name), (SCORES,))
             if not scored.end.abandoned:
-                write_json(folder / f"{name}.json", json.loads(scored.outputs["scores.json"]))
+                write_json(folder / f"{name}.json", json.loads(scored.outputs[SCORES]))
             return scored.end
 
         names = sorted(n for n, spec in zip(self.names(), self.specs, strict=True) if spec.kind in COMPARED)
@@ -138,7 +134,7 @@ class Proof(SealedRun):
         """
         answer = read_json(self.answers_folder / f"{name}.json")
         unlike = set(answer.get("conditions", ())) - {"short recording", "feedback only"}
-        if answer["fault"] is not None or unlike or any(effect not in CHEAP for effect in (one, other)):
+        if answer["fault"] is not None or unlike or any(effect not in COMMAND_EFFECTS for effect in (one, other)):
             return None
         path = self.root / "checks" / f"{name}.json"
         known = read_json(path) if path.exists() else {}

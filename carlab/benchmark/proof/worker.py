@@ -18,12 +18,13 @@ from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.core.errors import DataError
 
 FILES = ("fit.csv", "hold.csv", "car.toml")
+ANSWER, SCORES = "answer.json", "scores.json"
 ANOTHER_SEED = 10_000_000  # no set contains such seeds
 ATTEMPTS = 4
 
 
 def make(order: dict[str, Any]) -> None:
-    """Make one case: its files into ``handed``, its answer to ``answer``.
+    """Make the case ``spec`` in the working directory: its files, and its answer.
 
     If the car cannot be driven with the effect at any strength, the case gets another, fixed seed.
     """
@@ -36,25 +37,24 @@ def make(order: dict[str, Any]) -> None:
         except DataError:
             if attempt == ATTEMPTS - 1:
                 raise
-    folder = Path(order["handed"])
-    folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "fit.csv", case.fit)
-    write_csv(folder / "hold.csv", case.hold)
-    case.nominal.write(folder / "car.toml")
+    fit, hold, car = map(Path, FILES)
+    write_csv(fit, case.fit)
+    write_csv(hold, case.hold)
+    case.nominal.write(car)
     answer = case.answer()
-    answer["files"] = {file: file_digest(folder / file) for file in FILES}
+    answer["files"] = {file: file_digest(Path(file)) for file in FILES}
     answer["seconds_to_make"] = round(time.perf_counter() - begin, 3)
-    write_json(Path(order["answer"]), answer)
+    write_json(Path(ANSWER), answer)
 
 
 def baselines(order: dict[str, Any]) -> None:
-    """Run every baseline on the case in the working directory and write the results to ``to``."""
+    """Run every baseline on the case in the working directory with its noise ``floor``, and write the results."""
     from carlab.benchmark.baselines.run import require_studies, run_baselines
     from carlab.benchmark.world.base_car import BaseCar
 
     require_studies()
-    fit, hold = (read_csv(Path(file)) for file in FILES[:2])
-    write_json(Path(order["to"]), run_baselines(fit, hold, BaseCar.read(Path("car.toml")), order["floor"]))
+    fit, hold, car = map(Path, FILES)
+    write_json(Path(SCORES), run_baselines(read_csv(fit), read_csv(hold), BaseCar.read(car), order["floor"]))
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
