@@ -105,7 +105,7 @@ def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: N
     steering, throttle, latency = (v.expand(shape) for v in (steering, throttle, latency))
     whole = [torch.floor(v.detach() / period_s) for v in (steering, throttle, latency)]
     phases = [steering - whole[0] * period_s, throttle - whole[1] * period_s]
-    look = period_s - (latency - whole[2] * period_s)
+    capture = period_s - (latency - whole[2] * period_s)
     distinct = [phases[0]]
     # Two equal delays may depend on different parameters.
     differentiable = phases[0].requires_grad or phases[1].requires_grad
@@ -114,16 +114,16 @@ def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: N
     sorted_phases, order = torch.stack(distinct).sort(dim=0, stable=True)
     # Order of the switches; between two simultaneous switches there is a piece of length zero.
     places = [order.argsort(dim=0)[channel % len(distinct)] for channel in range(2)]
-    ends = torch.cat([sorted_phases, torch.full_like(look, period_s)[None]])
-    starts = torch.cat([torch.zeros_like(look)[None], ends[:-1]])
+    ends = torch.cat([sorted_phases, torch.full_like(capture, period_s)[None]])
+    starts = torch.cat([torch.zeros_like(capture)[None], ends[:-1]])
     pieces = []
     for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
         length = end - start
         longest_s = float(length.detach().max())
         if longest_s <= 0.0 and not length.requires_grad:
             continue
-        has_capture = (look.detach() > start.detach()) & (look.detach() <= end.detach())
-        after = torch.where(has_capture, look - start, torch.zeros_like(look)) if bool(has_capture.any()) else None
+        has_capture = (capture.detach() > start.detach()) & (capture.detach() <= end.detach())
+        after = torch.where(has_capture, capture - start, 0.0) if bool(has_capture.any()) else None
         pieces.append(
             Piece(
                 start,

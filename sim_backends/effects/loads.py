@@ -104,8 +104,8 @@ class RollDynamics(DynamicsEffect):
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale both side forces and set the rates of the roll."""
         shift, rate = forces.states["roll_dynamics.shift"], forces.states["roll_dynamics.shift_rate"]
-        kept = ops.at_least(1.0 - _loss(ops, values) * shift * shift, MIN_FORCE_SHARE)
-        forces.side_front, forces.side_rear = forces.side_front * kept, forces.side_rear * kept
+        share = ops.at_least(1.0 - _loss(ops, values) * shift * shift, MIN_FORCE_SHARE)
+        forces.side_front, forces.side_rear = forces.side_front * share, forces.side_rear * share
         omega = 2.0 * math.pi * ops.where(values["frequency"] < MAX_ROLL_HZ, values["frequency"], MAX_ROLL_HZ)
         forces.rates["roll_dynamics.shift"] = rate
         forces.rates["roll_dynamics.shift_rate"] = omega * (

@@ -37,7 +37,7 @@ class LongitudinalSlip(DynamicsEffect):
 
     The state is the slip speed ``s = R w - vx``. Its eigenvalue, ``(R^2/J + 1/m) stiffness / max(|vx|, 0.3)``, is
     thousands per second, so each Runge-Kutta step takes the pair (s, vx), all other forces held, by the implicit Euler
-    rule in four substeps and drives the car with the mean force: stable for every inertia, and momentum is kept.
+    rule in four substeps and drives the car with the mean force: stable for every inertia, and momentum is conserved.
     """
 
     id = "longitudinal_slip"

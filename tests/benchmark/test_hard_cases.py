@@ -127,7 +127,7 @@ def test_feedback_driver_never_leaves_the_mode_that_follows_the_track() -> None:
     driver = HumanDriver(BaseCar(), Track(np.random.default_rng(3)), np.random.default_rng(4), feedback_only=True)
     modes = set()
     for k in range(200):
-        driver._intend(float(k), 0.0)
+        driver._choose_mode(float(k), 0.0)
         modes.add(driver._mode)
     assert modes == {"follow"}
 

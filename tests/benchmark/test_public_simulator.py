@@ -14,7 +14,7 @@ from carlab.benchmark.effects.catalogue import EFFECT_IDS
 from carlab.benchmark.public_simulators import commonroad as public_simulator
 from carlab.benchmark.public_simulators.commonroad import SCALE, Model, PublicCar, drive_public, parameters
 from carlab.benchmark.public_simulators.commonroad_effects import PHYSICS, physics_of
-from carlab.benchmark.public_simulators.study import activity, hand_over, nominal_text, study
+from carlab.benchmark.public_simulators.study import activity, nominal_text, study, write_inputs
 from carlab.benchmark.world.measurement import read_csv
 from carlab.cars import load_car_file
 from carlab.core.errors import CarlabError, ConfigError
@@ -190,7 +190,7 @@ def test_stopped_study_writes_its_present_results(tmp_path: Path) -> None:
 
 def test_activity_of_a_drive_at_the_steering_rate_limit(tmp_path: Path) -> None:
     car = PublicCar("multi_body")
-    shares = activity(car, hand_over(car, 1, tmp_path, (2.0, 1.0)))
+    shares = activity(car, write_inputs(car, 1, tmp_path, (2.0, 1.0)))
     assert 0.0 <= shares["share of time at the steering-rate limit"] <= 1.0
     assert shares["speed [m/s], 95th percentile"] > 0.7
 

@@ -11,13 +11,13 @@ from carlab.jobs.child_jobs import PYTHON
 
 
 def test_diagnosis_does_not_need_python_on_the_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def hand_over(car: Any, seed: int, folder: Path, *more: Any) -> None:
+    def write_inputs(car: Any, seed: int, folder: Path, *more: Any) -> None:
         folder.mkdir(parents=True)
         for file in module.FILES:
             (folder / file).write_text(f"content of {file}")
         (folder / "report.html").write_text("of an earlier run")
 
-    monkeypatch.setattr(module, "hand_over", hand_over)
+    monkeypatch.setattr(module, "write_inputs", write_inputs)
     monkeypatch.setattr(module, "PublicCar", lambda model: SimpleNamespace(model=model))
     monkeypatch.setattr(module, "activity", lambda car, drive: {})
     monkeypatch.setattr(module, "version", lambda package: "0")

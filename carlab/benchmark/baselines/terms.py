@@ -17,7 +17,7 @@ import numpy as np
 
 from carlab.benchmark.baselines.data import Prepared, Steps
 from carlab.benchmark.cases.refit import CommandChange
-from carlab.benchmark.cases.set_check import CHEAP, mapped
+from carlab.benchmark.cases.set_check import COMMAND_EFFECTS, mapped
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.simulation import FloatArray
 
@@ -35,7 +35,7 @@ _SIZES = {
 def library(data: Prepared) -> dict[str, Term]:
     """All terms by ``id`` or ``id:part``, for one case."""
     car = data.car
-    terms: dict[str, Term] = {name: _command_term(CHEAP[name][0](size, car)) for name, size in _SIZES.items()}
+    terms: dict[str, Term] = {name: _command_term(COMMAND_EFFECTS[name][0](size, car)) for name, size in _SIZES.items()}
     terms |= {name: _command_term(change) for name, change in _other_commands(data).items()}
     terms |= {
         "rolling_resistance": _force(lambda s, v: (-np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),

@@ -68,7 +68,7 @@ def _dead_band(half: float) -> CommandChange:
 
 
 # By effect: change of the acting commands by a value v of its parameter in a car, and the range of the parameter.
-CHEAP: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, float]]] = {
+COMMAND_EFFECTS: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, float]]] = {
     "command_delay": (lambda v, car: _delay((0, 1), v), (-0.03, 0.15)),
     "mocap_latency": (lambda v, car: _delay((0, 1), v), (-0.03, 0.15)),
     "steering_delay": (lambda v, car: _delay((0,), v), (0.0, 0.2)),
@@ -105,9 +105,9 @@ def indistinguishable(
         floor: Noise floors of the six channels (6,).
 
     Returns:
-        None if one of the effects is not in CHEAP.
+        None if one of the effects is not in COMMAND_EFFECTS.
     """
-    if one not in CHEAP or other not in CHEAP:
+    if one not in COMMAND_EFFECTS or other not in COMMAND_EFFECTS:
         return None
     recordings = [_recording(table) for table in (fit, hold)]
     gain = _window_losses(one, nominal, recordings, floor) - _window_losses(other, nominal, recordings, floor)
@@ -116,7 +116,7 @@ def indistinguishable(
 
 
 def _window_losses(name: str, nominal: BaseCar, recordings: list[Recording], floor: FloatArray) -> FloatArray:
-    change_of, bounds = CHEAP[name]
+    change_of, bounds = COMMAND_EFFECTS[name]
 
     def cut(value: float) -> list[Windows]:
         changes = [change_of(value, nominal)]

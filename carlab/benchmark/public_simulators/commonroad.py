@@ -163,10 +163,10 @@ class RollingDriver(HumanDriver):
             throttle = max(throttle, 0.3)
         return float(np.clip(steering, -max_steering, max_steering)), throttle
 
-    def _intend(self, t: float, off: float) -> None:
-        super()._intend(t, off)
+    def _choose_mode(self, t: float, off: float) -> None:
+        super()._choose_mode(t, off)
         while self._mode in ("stand", "reverse"):
-            super()._intend(t, off)
+            super()._choose_mode(t, off)
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ dropout = 0.0
 """
 
 
-def hand_over(
+def write_inputs(
     car: PublicCar, seed: int, folder: Path, lengths_s: Sequence[float] = (100.0, 40.0),
     abandon: Callable[[], bool] = lambda: False,
 ) -> PublicDrive:  # fmt: skip
@@ -150,37 +150,37 @@ def study(
     rows: list[dict[str, Any]] = []
     for seed in seeds:
         car = PublicCar(model)
-        handed = out / f"seed_{seed}"
+        folder = out / f"seed_{seed}"
         progress(f"seed {seed}: driving the package's {model} car")
         try:
-            drive = hand_over(car, seed, handed, lengths_s, abandon)
+            drive = write_inputs(car, seed, folder, lengths_s, abandon)
         except AbandonedError:
             break
         except DataError as error:
             rows.append({"seed": seed, "verdict": None, "exit_status": None, "seconds": 0.0, "output": str(error)})
             continue
         progress(f"seed {seed}: diagnosing")
-        run = _diagnose(handed, command, timeout_s, abandon)
+        run = _diagnose(folder, command, timeout_s, abandon)
         if run is None:
             break
-        rows.append(_row(car, seed, run, handed / "report.json") | {"activity": activity(car, drive)})
-    write_json(out / "study.json", {"facts": facts, "asked_ratio": TARGET_RATIO, "seeds": rows})
+        rows.append(_row(car, seed, run, folder / "report.json") | {"activity": activity(car, drive)})
+    write_json(out / "study.json", {"facts": facts, "target_ratio": TARGET_RATIO, "seeds": rows})
     (out / "study.md").write_text(study_page(facts, rows), encoding="utf-8")
     return rows
 
 
 def _diagnose(
-    handed: Path, command: Sequence[str], timeout_s: float, abandon: Callable[[], bool]
+    folder: Path, command: Sequence[str], timeout_s: float, abandon: Callable[[], bool]
 ) -> dict[str, Any] | None:
     arguments = (*command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out")
-    inputs = {file: (handed / file).read_bytes() for file in FILES}
+    inputs = {file: (folder / file).read_bytes() for file in FILES}
     outputs = tuple(f"out/{file}" for file in REPORT_FILES)
     done = run_job(ChildJob(arguments, timeout_s, inputs, outputs), abandon)
     if done.end.abandoned:
         return None
     for file in REPORT_FILES:
-        (handed / file).unlink(missing_ok=True)
-    done.write_outputs(handed)
+        (folder / file).unlink(missing_ok=True)
+    done.write_outputs(folder)
     return {"exit_status": done.end.exit_status, "seconds": round(done.end.seconds, 1), "output": done.end.output}
 
 

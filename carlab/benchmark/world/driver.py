@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.simulation import FloatArray
 
 MODES = ("follow", "steps", "coast", "stand", "reverse", "slow")
@@ -44,14 +44,14 @@ class HumanDriver:
     def __init__(self, car: BaseCar, track: Track, rng: np.random.Generator, *, feedback_only: bool = False) -> None:
         self._car, self._track, self._rng = car, track, rng
         self._feedback_only = feedback_only
-        self._grip = min(car.mu_front, car.mu_rear) * 9.81
+        self._grip = min(car.mu_front, car.mu_rear) * GRAVITY_MPS2
         if car.kind == "linear_tyre":
             self._grip = min(self._grip, 6.0)
         self._direction = 1 if rng.random() < 0.5 else -1
-        self._mode, self._until, self._speed, self._turn = "stand", float(rng.uniform(0.5, 1.2)), 1.0, 0.0
+        self._mode, self._mode_end_s, self._speed, self._steering = "stand", float(rng.uniform(0.5, 1.2)), 1.0, 0.0
         self._throttle = 0.0
-        self._wobble = np.zeros(2)
-        self._boldness = float(rng.uniform(0.75, 1.05))
+        self._noise = np.zeros(2)
+        self._grip_share = float(rng.uniform(0.75, 1.05))
 
     def start(self) -> tuple[float, ...]:
         """Initial pose on the track, at standstill."""
@@ -65,36 +65,36 @@ class HumanDriver:
         x, y, psi, vx = (float(v) for v in state[:4])
         i = self._track.nearest(x, y)
         off = math.hypot(*(self._track.points[i] - (x, y)))
-        if t >= self._until or (off > 1.5 and self._mode in ("steps", "reverse", "coast")):
-            self._intend(t, off)
+        if t >= self._mode_end_s or (off > 1.5 and self._mode in ("steps", "reverse", "coast")):
+            self._choose_mode(t, off)
         decay = math.exp(-period / 0.35)
         if not self._feedback_only:
-            self._wobble = decay * self._wobble + math.sqrt(1 - decay**2) * self._rng.normal(0.0, (0.08, 0.05))
-        steering = self._pursue(i, x, y, psi, vx)
+            self._noise = decay * self._noise + math.sqrt(1 - decay**2) * self._rng.normal(0.0, (0.08, 0.05))
+        steering = self._pure_pursuit(i, x, y, psi, vx)
         if self._mode == "steps":
-            steering = self._turn
+            steering = self._steering
         elif self._mode == "reverse":
-            steering = self._turn * 0.7
-        throttle = self._foot(vx, abs(steering))
+            steering = self._steering * 0.7
+        throttle = self._throttle_for(vx, abs(steering))
         return (
-            float(np.clip(steering + self._wobble[0] * (self._mode != "stand"), -1.0, 1.0)),
+            float(np.clip(steering + self._noise[0] * (self._mode != "stand"), -1.0, 1.0)),
             float(np.clip(throttle, -1.0, 1.0)),
         )
 
-    def _intend(self, t: float, off: float) -> None:
+    def _choose_mode(self, t: float, off: float) -> None:
         rng = self._rng
         follow_only = self._feedback_only or off >= 1.0
         shares = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0) if follow_only else (0.46, 0.25, 0.07, 0.04, 0.08, 0.10)
         self._mode = str(rng.choice(MODES, p=shares))
         length = {"follow": (1.5, 5.0), "steps": (0.25, 0.9), "coast": (0.6, 1.5), "stand": (0.5, 1.2)}
-        self._until = t + float(rng.uniform(*length.get(self._mode, (1.5, 3.0))))
+        self._mode_end_s = t + float(rng.uniform(*length.get(self._mode, (1.5, 3.0))))
         self._speed = float(rng.uniform(0.7, 3.2))
-        self._turn = float(rng.choice((-1.0, 1.0)) * rng.choice((0.12, 0.3, 0.5, 0.8, 1.0)) * rng.uniform(0.8, 1.0))
+        self._steering = float(rng.choice((-1.0, 1.0)) * rng.choice((0.12, 0.3, 0.5, 0.8, 1.0)) * rng.uniform(0.8, 1.0))
         self._throttle = float(rng.uniform(-0.25, 0.75))
         if self._mode == "follow" and rng.random() < 0.25:
             self._direction = -self._direction
 
-    def _pursue(self, i: int, x: float, y: float, psi: float, vx: float) -> float:
+    def _pure_pursuit(self, i: int, x: float, y: float, psi: float, vx: float) -> float:
         ahead_m = 0.45 + 0.3 * abs(vx)
         j = (i + self._direction * round(ahead_m / self._track.spacing_m)) % len(self._track.points)
         dx, dy = self._track.points[j] - (x, y)
@@ -105,7 +105,7 @@ class HumanDriver:
         angle = math.atan(2 * self._car.wheelbase * math.sin(bearing) / distance)
         return angle / self._car.max_angle
 
-    def _foot(self, vx: float, turn: float) -> float:
+    def _throttle_for(self, vx: float, turn: float) -> float:
         if self._mode == "coast":
             return 0.0
         if self._mode == "stand":
@@ -113,10 +113,10 @@ class HumanDriver:
         if self._mode == "steps":
             return self._throttle if abs(vx) < 3.0 else 0.0
         curvature = math.tan(min(turn, 1.0) * self._car.max_angle) / self._car.wheelbase
-        wanted = min(self._speed, self._boldness * math.sqrt(self._grip / max(curvature, 0.2)))
+        wanted = min(self._speed, self._grip_share * math.sqrt(self._grip / max(curvature, 0.2)))
         if self._mode == "slow":
             wanted = 0.6
         if self._mode == "reverse":
             wanted = -0.8
         hold = self._car.damping * wanted / self._car.drive_gain
-        return hold + 0.35 * (wanted - vx) + float(self._wobble[1])
+        return hold + 0.35 * (wanted - vx) + float(self._noise[1])
