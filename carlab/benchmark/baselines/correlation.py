@@ -44,9 +44,10 @@ def _strongest(data: Prepared, command: int, channels: tuple[int, ...]) -> float
     whitener = _whitener(fit.commands[:, command])
     whitened_commands = lfilter(whitener, [1.0], fit.commands[:, command] - fit.commands[:, command].mean())
     fast = (fit.measured[rows, 3] > 2.0 * SLOW_MPS)[AR_ORDER:]
+    weight = fit.measured[rows, 3] if command == 0 else 1.0  # the influence of steering grows with speed
     best = 0.0
     for channel in channels:
-        whitened_errors = lfilter(whitener, [1.0], errors[:, channel] * _speed_weight(data, rows, command))[AR_ORDER:]
+        whitened_errors = lfilter(whitener, [1.0], errors[:, channel] * weight)[AR_ORDER:]
         clip_at = CLIP_MEDIANS * float(np.median(np.abs(whitened_errors)))
         whitened_errors = np.clip(whitened_errors, -clip_at, clip_at) * fast
         correlations = [
@@ -56,11 +57,6 @@ def _strongest(data: Prepared, command: int, channels: tuple[int, ...]) -> float
         sums = np.convolve(correlations, np.ones(SUMMED_LAGS), "valid") * np.sqrt(len(whitened_errors) / SUMMED_LAGS)
         best = max(best, float(np.abs(sums).max()))
     return best
-
-
-def _speed_weight(data: Prepared, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]], command: int) -> FloatArray:
-    """Weights (M,) of the errors: the speed for steering, whose influence grows with it, and 1 for throttle."""
-    return data.fit.measured[rows, 3] if command == 0 else np.ones(len(rows))
 
 
 def _whitener(series: FloatArray) -> FloatArray:

@@ -133,12 +133,9 @@ def _angle(s: Steps) -> FloatArray:
     return np.asarray(s.car.max_angle * s.commands()[:, :, 0].mean(axis=1))
 
 
-def _push(s: Steps) -> FloatArray:
-    return np.asarray(s.car.drive_gain * s.commands()[:, :, 1].mean(axis=1))
-
-
 def _combined(s: Steps, scale: float) -> FloatArray:
-    share = np.clip(scale * _push(s) / (s.car.mu_rear * s.car.load_rear), -0.9, 0.9)
+    drive_n = s.car.drive_gain * s.commands()[:, :, 1].mean(axis=1)
+    share = np.clip(scale * drive_n / (s.car.mu_rear * s.car.load_rear), -0.9, 0.9)
     return np.asarray(np.sqrt(1.0 - share**2))
 
 

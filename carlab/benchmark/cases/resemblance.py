@@ -67,7 +67,8 @@ class CatalogueInfluence:
         world = World(self._car)
         form.attach(world, parameters)
         dynamic = rates_along(world, self._driven) - self._rates
-        return self._projected(self._blocks(dynamic + self._observed(world)))
+        influence = self._blocks(dynamic + self._observed(world))
+        return np.asarray(influence - self._base @ (self._base.T @ influence), dtype=np.float64)
 
     def closest(self, influence: FloatArray) -> Resemblance:
         """The effect of the catalogue that explains most of an influence (3 K,) from ``of``."""
@@ -120,9 +121,6 @@ class CatalogueInfluence:
         count = len(accelerations) // length
         means = accelerations[: count * length].reshape(count, length, 3).mean(axis=1)
         return np.asarray((means / self._floor).ravel(), dtype=np.float64)
-
-    def _projected(self, influence: FloatArray) -> FloatArray:
-        return np.asarray(influence - self._base @ (self._base.T @ influence), dtype=np.float64)
 
 
 def _one_form_each() -> Sequence[Form]:

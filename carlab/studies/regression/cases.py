@@ -79,7 +79,7 @@ class Case:
         output_std: units of the outputs (O,).
         discrepancy_std: standard deviation of the authors' discrepancy process (O,); None: the simulator is exact.
         discrepancy_lengthscale: lengthscale of that process on raw inputs.
-        function_lengthscale: lengthscale of the Gaussian-process prior of FSVGD and GreyBox on normalised inputs.
+        function_lengthscale: lengthscale of the Gaussian-process prior of FSVGD on normalised inputs.
         prior_discrepancy: prior size of carlab's discrepancy, in units of the outputs; None: the simulator is exact.
         body_frame: the same case in the body frame for all methods but those of the paper; None: the same coordinates.
         in_body_frame: whether rows are transformed to the car's frame at the start of the step.

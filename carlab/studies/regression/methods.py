@@ -122,10 +122,6 @@ class FitTask:
         generator = torch.Generator().manual_seed(20_000 + self.seed)
         return self.case.prior.inputs(POOL_POINTS, generator).to(self.data.inputs)
 
-    def function_prior(self) -> RbfCovariance:
-        """Gaussian-process prior of FSVGD and of GreyBox: one normalised unit everywhere."""
-        return RbfCovariance((1.0,) * len(self.case.output_std), (self.case.function_lengthscale,))
-
     def posterior(
         self, simulator: DomainModel | None, inputs: Tensor, outputs: Tensor, size: Size
     ) -> FunctionPosterior:
@@ -190,9 +186,10 @@ class FitTask:
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
     def fsvgd(self, *, corrected: bool) -> Model:
-        """The paper's FSVGD: a Gaussian-process prior."""
-        normaliser, pool = self.normaliser, self.pool()
-        prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), self.function_prior())
+        """The paper's FSVGD: a Gaussian-process prior of one normalised unit."""
+        case, normaliser, pool = self.case, self.normaliser, self.pool()
+        covariance = RbfCovariance((1.0,) * len(case.output_std), (case.function_lengthscale,))
+        prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), covariance)
         settings = self.authors_settings(with_simulator=False, corrected=corrected)
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
