@@ -20,7 +20,9 @@ class EndReason(enum.Enum):
         "enlarge the arena (that of the car file, else that of the task)."
     )
     OVERSPEED = "The car was faster than its speed limit; lower the throttle or raise max_speed_mps."
-    POSE_STALE = "Motion capture sends no poses; check the camera software, the network and that the body is visible."
+    POSE_STALE = (
+        "Motion capture sends no fresh poses; check the camera software, the network and that the body is visible."
+    )
     POSE_JUMP = "The pose jumped further than the car can drive; check that Motive confuses no other body with the car."
     POSE_FROZEN = "The pose did not change while the motor turned; check that motion capture streams live poses."
     TRACKING_LOST = "Motion capture lost the body; check the markers and the capture volume."

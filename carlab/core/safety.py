@@ -188,6 +188,41 @@ class FrozenPoseDetector:
         return None if frozen_s <= self.frozen_pose_s else f"It was unchanged for {frozen_s:.2f} s."
 
 
+class LatePoseDetector:
+    """Detects poses that still arrive, but ever later after their exposure (a busy camera computer or network).
+
+    The smallest latency from exposure to arrival since ``reset`` is the normal one: it contains neither jitter nor
+    waiting times, and a drift of the clocks by 100 ppm changes it by 0.1 s within 17 minutes only.
+    """
+
+    def __init__(self, envelope: SafetyEnvelope) -> None:
+        self._envelope = envelope
+        self.reset()
+
+    def reset(self) -> None:
+        """Reset the detector."""
+        self._normal_latency_s = math.inf
+        self._late_since_s: float | None = None
+
+    def age_s(self, observation: Observation, now_s: float) -> float:
+        """Age of the pose beyond the normal latency [s]."""
+        self._normal_latency_s = min(self._normal_latency_s, observation.t_receive_s - observation.t_capture_s)
+        return now_s - observation.t_capture_s - self._normal_latency_s
+
+    def problem(self, observation: Observation, now_s: float) -> str | None:
+        """Describe poses that have been older than ``stale_pose_s`` for ``lost_pose_s``; None if they have not."""
+        if self.age_s(observation, now_s) <= self._envelope.stale_pose_s:
+            self._late_since_s = None
+            return None
+        if self._late_since_s is None:
+            self._late_since_s = now_s
+        if now_s - self._late_since_s <= self._envelope.lost_pose_s:
+            return None
+        latency_ms = (observation.t_receive_s - observation.t_capture_s) * 1e3
+        normal_ms = self._normal_latency_s * 1e3
+        return f"The poses arrive {latency_ms:.0f} ms after their exposure; before, it was {normal_ms:.0f} ms."
+
+
 def _has_moved(now: CarState, then: CarState) -> bool:
     moved_m = math.hypot(now.x_m - then.x_m, now.y_m - then.y_m)
     turned_rad = abs(float(wrap(now.yaw_rad - then.yaw_rad)))
@@ -233,6 +268,7 @@ class SafeCar:
         self._sent_s: float | None = None
         self._seen: Observation | None = None
         self._frozen = FrozenPoseDetector(envelope.frozen_pose_s)
+        self._late = LatePoseDetector(envelope)
         self._active: frozenset[str] = frozenset()
         self._watchdog_trips = 0
 
@@ -243,6 +279,7 @@ class SafeCar:
         self._sent, self._sent_s, self._seen = NEUTRAL, None, None
         self._watchdog_trips = self.car.watchdog_trips
         self._frozen.reset()
+        self._late.reset()
 
     def command(self, requested: Action, observation: Observation, period_s: float) -> Action:
         """Limit and send a command; returns the command sent.
@@ -262,8 +299,10 @@ class SafeCar:
             self._end(*found, now_s)
         if (frozen := self._frozen.problem(observation, self._sent, now_s)) is not None:
             self._end(EndReason.POSE_FROZEN, frozen, now_s)
+        if (late := self._late.problem(observation, now_s)) is not None:
+            self._end(EndReason.POSE_STALE, late, now_s)
         self._seen = observation
-        age_s = now_s - observation.t_receive_s
+        age_s = self._late.age_s(observation, now_s)
         kinds: dict[str, str] = {}
         if age_s > self.envelope.stale_pose_s:
             kinds["stale_pose"] = f"The pose is {age_s * 1e3:.0f} ms old: neutral until a fresh pose arrives."

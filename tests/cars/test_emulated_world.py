@@ -167,8 +167,11 @@ def assert_no_process(pid: int) -> None:
 
 
 @pytest.mark.realtime
-def test_frozen_pose_with_new_stamps_ends_the_episode() -> None:
-    """Motion capture repeats one pose while the wheels turn: the safety gate stops the car in about half a second."""
+@pytest.mark.parametrize(
+    ("fault", "reason"), [({"frozen": True}, EndReason.POSE_FROZEN), ({"latency_s": 0.3}, EndReason.POSE_STALE)]
+)
+def test_fresh_arrivals_of_an_old_pose_end_the_episode(fault: dict[str, float], reason: EndReason) -> None:
+    """Motion capture repeats one pose with new stamps, or delays its frames: the car stops in about half a second."""
     events: list[SafetyEvent] = []
     with EmulatedCar(default_car()) as car:
         car.place(CarState())
@@ -181,10 +184,10 @@ def test_frozen_pose_with_new_stamps_ends_the_episode() -> None:
                 time.sleep(1.0 / 30.0)
 
         drive(30)
-        car.world.request(do="mocap", faults={"frozen": True})
-        frozen_s = time.monotonic()
+        car.world.request(do="mocap", faults=fault)
+        fault_s = time.monotonic()
         with pytest.raises(SafetyStop) as stop:
             drive(90)
-        assert time.monotonic() - frozen_s < 2.0
-    assert stop.value.reason == EndReason.POSE_FROZEN
-    assert events[-1].kind == "pose_frozen"
+        assert time.monotonic() - fault_s < 2.0
+    assert stop.value.reason == reason
+    assert events[-1].kind == reason.name.lower()
