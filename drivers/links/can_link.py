@@ -16,6 +16,10 @@ from drivers.links.link import CanFrame, LinkStatistics
 
 BUS_OFF: Final = 0x40
 """Bit of a Linux CAN error frame's identifier (CAN_ERR_BUSOFF)."""
+CONTROLLER_PROBLEM: Final = 0x04
+"""Bit of a Linux CAN error frame's identifier (CAN_ERR_CRTL); the second byte of its data has the details."""
+SENDS_ERROR_PASSIVE: Final = 0x20
+"""Detail: error-passive, since frames were repeated without acknowledgement (CAN_ERR_CRTL_TX_PASSIVE)."""
 MAX_FRAMES_PER_READ: Final = 256
 BITRATE_INTERFACES: Final = frozenset({"slcan", "pcan", "kvaser", "vector", "ixxat", "gs_usb", "usb2can", "canalystii"})
 
@@ -46,8 +50,11 @@ class CanLink:
     """Frame link on a CAN bus: a frame is sent at once or an ActuatorFaultError is raised.
 
     A frame that the controller cannot send now must not be sent later. Each send has a time-out of zero; after an
-    error the device closes the link, which drops the frames in the adapter's queue, and opens it again. An interface of
-    python-can raises the errors of its own library too; each of them is a failure of the bus.
+    error the device closes the link, which drops the frames in the adapter's queue, and opens it again. The queue of
+    socketcan belongs to the network interface: no program can drop its frames, and the kernel sends them when a cut bus
+    returns. There an error-passive controller, which shows a cut bus within milliseconds, is a failure of the bus: the
+    queue still has room for neutral behind the few moving commands. An interface of python-can raises the errors of its
+    own library too; each of them is a failure of the bus.
 
     With a ``controller_id``, the open link holds the lock on this controller (``drivers.links.bus_lock``).
     """
@@ -108,6 +115,8 @@ class CanLink:
                 if message.arbitration_id & BUS_OFF:
                     self._flush()
                     raise self._failed("the controller went bus-off")
+                if self._is_cut(message):
+                    raise self._failed("no device acknowledges the frames: the controller is error-passive")
             elif message.is_extended_id and not message.is_remote_frame and not self._is_echo(message):
                 frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
         return frames
@@ -144,6 +153,11 @@ class CanLink:
         socketcan returns none, but marks the frames of other programs on this computer in the same way.
         """
         return not message.is_rx and self.interface != "socketcan"
+
+    def _is_cut(self, error: can.Message) -> bool:
+        """Whether an error frame of socketcan reports that the controller has become error-passive by sending."""
+        is_of_controller = self.interface == "socketcan" and error.arbitration_id & CONTROLLER_PROBLEM
+        return bool(is_of_controller and len(error.data) > 1 and error.data[1] & SENDS_ERROR_PASSIVE)
 
     def _has_input(self) -> bool:
         """Whether ``recv`` returns at once: without input it waits as long as a backward step of the system clock."""

@@ -53,7 +53,7 @@ class FrameLink(Protocol):
         """Connect. Raises NotReadyError with the remedy."""
 
     def write(self, frame: CanFrame) -> None:
-        """Send a frame at once or raise; never queue it for later."""
+        """Send a frame at once or raise, without a queue of this program."""
 
     def read(self) -> list[CanFrame]:
         """Frames that have arrived, oldest first. Never blocks."""

@@ -219,6 +219,10 @@ class SenderLoop:
             self._link_failed(str(error))
 
     def _link_failed(self, text: str) -> None:
+        """Close the link after a last neutral command, where the link still takes one, and latch a fault."""
+        if self.logic.is_ready_to_send:
+            with contextlib.suppress(ActuatorFaultError):
+                self.device.send(self.logic.neutral)
         self._is_link_open = False
         self.device.close()
         self.logic.link_failed(text)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cut_can_bus import CutLink, Wire
 from faulty_frame_link import FaultyFrameLink
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
@@ -191,6 +192,23 @@ def test_bus_failure_latches_a_fault_and_the_firmware_times_out() -> None:
                 actuator.arm()
             actuator.reset_fault()
             actuator.arm()
+
+
+def test_cut_bus_that_returns_after_the_end_of_the_program_gets_neutral_last() -> None:
+    """The kernel sends the frames that waited in the transmit queue; no program could follow them with neutral."""
+    channel, wire = channel_name(), Wire()
+    with CanFirmware(VescFirmware(CommandLog()), "virtual", channel) as served:
+        device = VescCanDevice(CutLink(channel, wire), 23, 42)
+        with Actuator(config_for("virtual", channel), CALIBRATION, lambda c, k: SenderThread(c, k, device)) as actuator:
+            actuator.arm()
+            actuator.command(MOVING)
+            until(lambda: any(e.value == 3.0 for e in served.log.motor()))
+            wire.is_cut = True
+            until(lambda: actuator.status().state == SenderState.FAULT)
+            assert "error-passive" in actuator.status().fault
+        t_s = time.monotonic()
+        wire.mend(channel)
+        until(lambda: bool(served.log.motor(t_s)) and served.log.motor()[-1].value == 0.0)
 
 
 @pytest.mark.parametrize("victim", ["main", "sender"])

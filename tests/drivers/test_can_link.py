@@ -90,6 +90,23 @@ def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
     link.close()
 
 
+@pytest.mark.parametrize(
+    ("interface", "details", "is_fault"),
+    [("socketcan", 0x20, True), ("socketcan", 0x18, False), ("pcan", 0x20, False)],
+    ids=["sends error-passive", "warnings and receives error-passive", "another meaning"],
+)
+def test_controller_that_sends_without_acknowledgement_is_a_fault(interface: str, details: int, is_fault: bool) -> None:
+    link = BrokenLink(interface, f"test-{uuid.uuid4()}")
+    link.open()
+    link.bus.received = can.Message(arbitration_id=0x04, is_error_frame=True, data=bytes((0, details)))
+    if is_fault:
+        with pytest.raises(ActuatorFaultError, match=r"no device acknowledges .* check wiring, termination and power"):
+            link.read()
+    else:
+        assert link.read() == []
+    link.close()
+
+
 def test_echo_of_an_own_frame_is_ignored() -> None:
     link = BrokenLink("virtual", f"test-{uuid.uuid4()}")
     link.open()
