@@ -11,6 +11,8 @@ from drivers.calibration import ActuatorCalibration
 from drivers.device_kinds import DEVICE_KINDS, DeviceKind
 
 MULTICAST_GROUP = "239.74.163.2"
+BITS_PER_BYTE = 10
+"""Bits of a byte on a serial line: start bit, eight data bits, stop bit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,19 @@ class ActuatorConfig:
         for name in ("latch_s", "telemetry_lost_s"):
             if not math.isfinite(getattr(self, name)):
                 raise ConfigError(f"{name} in [hardware.actuator] is {getattr(self, name)}; give a finite number.")
+        self._check_baud()
+
+    def _check_baud(self) -> None:
+        """Raise ConfigError if the serial line is too slow for the rates: old commands would wait in its buffers."""
+        kind = self.device_kind
+        sent_bytes_per_s = self.rate_hz * kind.command_bytes + self.telemetry_rate_hz * kind.request_bytes
+        needed = math.ceil(max(sent_bytes_per_s, self.telemetry_rate_hz * kind.reply_bytes) * BITS_PER_BYTE)
+        if not kind.is_bus and self.baud < needed:
+            raise ConfigError(
+                f"baud in [hardware.actuator] is {self.baud}; rate_hz {self.rate_hz:g} and telemetry_rate_hz "
+                f"{self.telemetry_rate_hz:g} need at least {needed}. Set a higher baud, also in the {kind.name}, or "
+                "lower the rates; on USB remove baud, which has no effect there."
+            )
 
     def check_deadlines(self) -> None:
         """Raise ConfigError for a deadline that is too long for the car of a car file.

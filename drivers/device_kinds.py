@@ -16,7 +16,8 @@ class DeviceKind:
 
     ``factory`` is the import path ``module:function`` of a function from an ActuatorConfig to a Device; only the sender
     process imports it. ``name`` appears in messages and, in lower case, in the names of readings. ``silent_hint`` is
-    the remedy if no device answers, ``garbage_hint`` the remedy if the bytes that arrive are no valid frames.
+    the remedy if no device answers, ``garbage_hint`` the remedy if the bytes that arrive are no valid frames. The bytes
+    on a serial line are those of one command, one request of telemetry and one reply; 0 if they are unknown.
     """
 
     factory: str
@@ -24,6 +25,9 @@ class DeviceKind:
     silent_hint: str
     garbage_hint: str = ""
     is_bus: bool = False
+    command_bytes: int = 0
+    request_bytes: int = 0
+    reply_bytes: int = 0
 
     def load(self) -> Callable[[Any], Device]:
         """Import the factory."""
@@ -37,6 +41,9 @@ DEVICE_KINDS: dict[str, DeviceKind] = {
         name="VESC",
         silent_hint="the port opens but no device answers; switch the VESC on and check that 'port' is the VESC's.",
         garbage_hint="check 'port' and 'baud' in [hardware.actuator].",
+        command_bytes=18,
+        request_bytes=10,
+        reply_bytes=22,
     ),
     "vesc_can": DeviceKind(
         factory="drivers.vesc.can_device:make_device",
