@@ -13,7 +13,7 @@ from carlab.benchmark.world.simulation import drive
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.events import EventUse, find_events, grip_limits, mark_events
+from carlab.diagnosis.events import Event, EventUse, find_events, grip_limits, mark_events
 from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.report.events import diagnosed_event_sentences, event_sentences
@@ -194,6 +194,12 @@ def test_sentences_state_what_was_left_out(hit: EventDrive) -> None:
     assert f"{events[0].from_s:.2f}" in first
     assert "kept" in event_sentences(EventUse(events, False))[0]
     assert event_sentences(EventUse()) == []
+
+
+def test_line_of_an_event_has_one_kind_of_minus_sign() -> None:
+    event = Event("impact", 1.0, 1.25, -0.504, -12.3, -1.5, 0.2)
+    line = event_sentences(EventUse((event,)))[1]
+    assert line == "Recording 1, 1.00 to 1.25 s, x −0.5 m, y −12.3 m: impact (−1.5 m/s, 0.2 rad/s)."
 
 
 @pytest.mark.slow

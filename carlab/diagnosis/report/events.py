@@ -44,4 +44,5 @@ def event_label(event: Event) -> str:
 def _line(event: Event) -> str:
     role = f", {event.role}" if event.role else ""
     span = f"{event.from_s:.2f} to {event.to_s:.2f} s"
-    return f"Recording {event.recording}{role}, {span}, x {event.x_m:.2f} m, y {event.y_m:.2f} m: {event_label(event)}."
+    place = f"x {with_unit(round(event.x_m, 2), 'm')}, y {with_unit(round(event.y_m, 2), 'm')}"
+    return f"Recording {event.recording}{role}, {span}, {place}: {event_label(event)}."
