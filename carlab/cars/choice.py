@@ -8,10 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from carlab.cars.car_file import CarFile, default_car, is_preset, load_car_file
 from carlab.core.car import Car
 from carlab.core.errors import CarlabError, ConfigError
-from carlab.core.quantities import Action, ActionLimits, Reality
+from carlab.core.geofence import stopping_distance_m
+from carlab.core.quantities import Action, ActionLimits, CarState, Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.track import Track
 from drivers.config import ActuatorConfig
@@ -21,6 +24,11 @@ _LOG = logging.getLogger(__name__)
 PLUGIN_GROUP = "carlab.cars"
 WATCHDOG_PERIODS = 2.0
 """Minimum ratio of the watchdog to the control period, and of the latch to the watchdog, of a car without hardware."""
+COASTING_S = 10.0
+COASTING_STEP_S = 0.02
+"""Duration and step of the simulation of a coasting car [s]."""
+COASTING_MARGIN_M = 0.1
+"""Largest distance [m] by which a car may coast further than the geofence assumes, without a warning."""
 
 
 @dataclass(slots=True)
@@ -75,6 +83,7 @@ def choose_car(
     choice = _choose(name, vehicle, reality, seed)
     if is_driven:
         _check_watchdog(choice)
+        _warn_of_coasting(choice)
     if dry_run:
         from drivers.dry_run_car import DryRunCar
 
@@ -138,6 +147,35 @@ def _check_watchdog(choice: CarChoice) -> None:
             f"control_period in [timing] is {period_s:g} s, but the watchdog sets neutral {watchdog_s:g} s after a "
             f"command, within each tick; set a control_period below {watchdog_s:g} s, or a longer watchdog_s (and "
             "latch_s) in [hardware.actuator]."
+        )
+
+
+def _warn_of_coasting(choice: CarChoice) -> None:
+    """Warn if a real car that does not brake in neutral coasts further than the geofence assumes, by its car file."""
+    from drivers.hardware_car import HardwareCar
+    from sim_backends.plant import Plant
+
+    car, envelope = choice.car, choice.envelope
+    if not isinstance(car, HardwareCar) or car.config.calibration.neutral_brake_a > 0.0:
+        return
+    plant = Plant(choice.simulator)
+    plant.reset(CarState(vx_mps=envelope.max_speed_mps), 0.0)
+    try:
+        states = [plant.advance(t_s) for t_s in np.arange(0.0, COASTING_S, COASTING_STEP_S).tolist()]
+    except (OverflowError, ValueError):  # A simulator that diverges is no prediction of the car.
+        return
+    speed_mps = np.array([state.vx_mps for state in states])
+    coasts_m = states[-1].x_m - np.array([state.x_m for state in states]) + speed_mps * choice.simulator.command_delay_s
+    assumed_m = stopping_distance_m(speed_mps, envelope.reaction_s, envelope.deceleration_mps2)
+    worst = int(np.argmax(coasts_m - assumed_m))
+    if coasts_m[worst] - assumed_m[worst] > COASTING_MARGIN_M:
+        _LOG.warning(
+            "In neutral the car coasts: by its file %.1f m from %.1f m/s, but the geofence assumes %.1f m. Set "
+            "neutral_brake_a in [hardware.calibration], so that neutral brakes, or lower deceleration_mps2 or raise "
+            "reaction_s in [hardware.limits].",
+            coasts_m[worst],
+            speed_mps[worst],
+            assumed_m[worst],
         )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import pytest
 
-from carlab.cars import load_car_file
+from carlab.cars import choose_car, load_car_file
 from carlab.core.errors import ConfigError
 
 ARENA = "[hardware.arena]\ncorners_m = [[-1, -1], [1, -1], [1, 1], [-1, 1]]\n"
@@ -57,6 +58,29 @@ def test_limit_that_disables_a_guard_is_refused(tmp_path: Path, table: str, line
     with pytest.raises(ConfigError, match=message) as caught:
         load_car_file(car_file(tmp_path, table, *lines))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "lines", "warning"),
+    [
+        ("hardware", [], "coasts: by its file 3.3 m from 2.9 m/s, but the geofence assumes 1.9 m. Set neutral_brake_a"),
+        ("hardware.limits", ["deceleration_mps2 = 0.9", "max_speed_mps = 1"], "coasts: by its file 1.0 m from 0.9 m/s"),
+        ("hardware.limits", ["reaction_s = 1.2"], ""),
+        ("hardware.calibration", ["neutral_brake_a = 4.0"], ""),
+        ("motor", ["damping = 1e99"], ""),
+    ],
+)
+def test_real_car_that_coasts_further_than_the_geofence_assumes_gives_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, table: str, lines: list[str], warning: str
+) -> None:
+    path = car_file(tmp_path, table, *lines)
+    with caplog.at_level(logging.WARNING):
+        choose_car("sim", vehicle=path)
+        choose_car(path, is_driven=False)
+        assert caplog.text == ""
+        choose_car(path)
+    assert warning in caplog.text
+    assert bool(warning) == bool(caplog.text)
 
 
 def test_limits_up_to_their_bounds_are_accepted(tmp_path: Path) -> None:
