@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import logging
+import queue
 import threading
 from collections import deque
 from dataclasses import asdict, dataclass
@@ -30,39 +30,42 @@ class LogEntry:
 
 
 class CommandLog:
-    """Entries in memory and, if a path is given, in a file of JSON lines; each line is flushed, so a kill loses none.
+    """Entries in memory and, if a path is given, in a file of JSON lines, each of which is flushed.
 
-    The file is for people. If it cannot be written, the log warns once and continues in memory. It does not warn if the
-    folder is missing: a run that ends before its first episode removes its folder.
+    A thread writes the file, since a busy disk would delay the emulated firmware. The file is for people. If it cannot
+    be written, the log warns once and continues in memory. It does not warn if the folder is missing: a run that ends
+    before its first episode removes its folder.
     """
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
         self._entries: deque[LogEntry] = deque(maxlen=MAX_ENTRIES)
         self._lock = threading.Condition()
-        self._file: TextIO | None = None
+        self._unwritten: queue.SimpleQueue[LogEntry | None] = queue.SimpleQueue()
+        self._writer: threading.Thread | None = None
 
     def open(self) -> None:
-        """Open the file if a path was given; entries are appended."""
-        if self.path is not None and self._file is None:
-            try:
-                self._file = self.path.open("a", encoding="utf-8")
-            except FileNotFoundError:
-                return
-            except OSError as error:
-                self._give_up_file(error)
+        """Open the file if a path was given; entries are appended. Idempotent."""
+        if self.path is None or self._writer is not None:
+            return
+        try:
+            file = self.path.open("a", encoding="utf-8")
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            self._warn(error)
+            return
+        self._unwritten = queue.SimpleQueue()
+        self._writer = threading.Thread(target=self._write, args=(file,), name="command-log", daemon=True)
+        self._writer.start()
 
     def add(self, t_s: float, name: str, value: float = 0.0) -> None:
-        """Append an entry."""
+        """Append an entry, without waiting for the file."""
         entry = LogEntry(t_s, name, value)
         with self._lock:
             self._entries.append(entry)
-            if self._file is not None:
-                try:
-                    self._file.write(json.dumps(asdict(entry)) + "\n")
-                    self._file.flush()
-                except OSError as error:
-                    self._give_up_file(error)
+            if self._writer is not None and self._writer.is_alive():
+                self._unwritten.put(entry)
             self._lock.notify_all()
 
     def entries(self, *names: str, since_s: float = float("-inf")) -> list[LogEntry]:
@@ -81,24 +84,29 @@ class CommandLog:
             return self._first(name, since_s)
 
     def close(self) -> None:
-        """Close the file; the entries in memory stay."""
-        with self._lock:
-            if self._file is not None:
-                with contextlib.suppress(OSError):
-                    self._file.close()
-                self._file = None
+        """Write the last entries and close the file; the entries in memory stay."""
+        self._unwritten.put(None)
+        if self._writer is not None:
+            self._writer.join()
+            self._writer = None
 
-    def _give_up_file(self, error: OSError) -> None:
+    def _write(self, file: TextIO) -> None:
+        """Body of the writer thread."""
+        try:
+            with file:
+                while (entry := self._unwritten.get()) is not None:
+                    file.write(json.dumps(asdict(entry)) + "\n")
+                    file.flush()
+        except OSError as error:
+            self._warn(error)
+
+    def _warn(self, error: OSError) -> None:
         logger.warning(
             "The log of the emulated firmware cannot be written to %s (%s); %s.",
             self.path,
             error.strerror or error,
             _remedy(error),
         )
-        if self._file is not None:
-            with contextlib.suppress(OSError):
-                self._file.close()
-            self._file = None
 
     def _first(self, name: str, since_s: float) -> LogEntry | None:
         return next((e for e in self._entries if e.name == name and e.t_s >= since_s), None)

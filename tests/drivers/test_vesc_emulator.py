@@ -16,6 +16,7 @@ from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.speed import sender_lateness
 from drivers.vesc.payloads import MotorValues, decode_reply
+from tests.helpers.waiting import until
 
 
 def test_motor_times_out_and_only_motor_commands_reset_its_timer() -> None:
@@ -108,7 +109,7 @@ def test_reconnecting_host_with_captured_bytes_is_answered(tmp_path: Path, vesc_
             os.close(host)
             assert log.wait_for("hang_up", 20.0, t_s) is not None
         assert [e.value for e in log.motor()] == [1.5] * 3
-        assert read_log(tmp_path / "log.jsonl") == log.entries(), "flushed line by line"
+        until(lambda: read_log(tmp_path / "log.jsonl") == log.entries())
     assert not (tmp_path / "vesc").is_symlink()
 
 
