@@ -56,6 +56,7 @@ class SerialFirmware:
         self._lock = threading.Lock()
         self._master: int | None = None
         self._terminal = ""
+        self._unplugged: list[int] = []
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._has_host = False
@@ -80,10 +81,15 @@ class SerialFirmware:
         self._thread.start()
 
     def unplug(self) -> None:
-        """Remove the terminal, as an unplugged cable does. The firmware keeps running and times out."""
+        """Remove the terminal, as an unplugged cable does. The firmware keeps running and times out.
+
+        Until ``close`` no other terminal gets its name; a host that reconnects would find the device of another car.
+        """
         with self._lock:
             if self._master is None:
                 return
+            # The system would give the name of a terminal that no process has open to the next one.
+            self._unplugged.append(os.open(self._terminal, os.O_RDWR | os.O_NOCTTY))
             os.close(self._master)
             self._master = None
             self._has_host = False
@@ -121,6 +127,8 @@ class SerialFirmware:
             if self._master is not None:
                 os.close(self._master)
                 self._master = None
+            while self._unplugged:
+                os.close(self._unplugged.pop())
             if self.link is not None and self.link.is_symlink():
                 self.link.unlink()
         self.log.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import time
@@ -111,6 +112,19 @@ def test_reconnecting_host_with_captured_bytes_is_answered(tmp_path: Path, vesc_
         assert [e.value for e in log.motor()] == [1.5] * 3
         until(lambda: read_log(tmp_path / "log.jsonl") == log.entries())
     assert not (tmp_path / "vesc").is_symlink()
+
+
+def test_no_other_terminal_gets_the_name_of_an_unplugged_one() -> None:
+    """A sender that reconnects by the name of its port must not find the firmware of another car."""
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(SerialFirmware(VescFirmware(CommandLog())))
+        name = first.port
+        first.unplug()
+        assert not Path(name).exists()
+        later = [stack.enter_context(SerialFirmware(VescFirmware(CommandLog()))) for _ in range(4)]
+        assert name not in [firmware.port for firmware in later]
+        first.replug()
+        assert Path(first.port).exists()
 
 
 def test_wire_faults_drop_and_corrupt_frames() -> None:
