@@ -116,7 +116,7 @@ class CanLink:
                     self._flush()
                     raise self._failed("the controller went bus-off")
                 if self._is_cut(message):
-                    raise self._failed("no device acknowledges the frames: the controller is error-passive")
+                    raise self._failed("no device acknowledges frames of this bitrate: the controller is error-passive")
             elif message.is_extended_id and not message.is_remote_frame and not self._is_echo(message):
                 frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
         return frames
