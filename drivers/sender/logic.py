@@ -72,9 +72,9 @@ ORDER_SIZE = _ORDER.size
 class SenderLogic:
     """The state machine of the sender.
 
-    The methods ``link_up``, ``firmware``, ``telemetry``, ``link_failed``, ``order`` and ``main_lost`` are its events;
-    ``decide`` returns the command to write. It returns neutral unless the sender is ARMED, the command was issued in
-    the current epoch, is younger than the watchdog's deadline, lies within the calibration's limits, and the
+    The methods ``link_up``, ``firmware``, ``telemetry``, ``link_failed``, ``order``, ``resumed`` and ``main_lost`` are
+    its events; ``decide`` returns the command to write. It returns neutral unless the sender is ARMED, the command was
+    issued in the current epoch, is younger than the watchdog's deadline, lies within the calibration's limits, and the
     telemetry is fresh. A fault stays latched until ``RESET_FAULT``; then a new ARM is needed.
     """
 
@@ -152,6 +152,11 @@ class SenderLogic:
     def telemetry_age_s(self, now_s: float) -> float:
         """Age of the newest telemetry [s]; infinite before the first."""
         return float("inf") if self.t_values_s is None else now_s - self.t_values_s
+
+    def resumed(self) -> None:
+        """Event: the computer was suspended; latches a fault if armed, since the last command still seems fresh."""
+        if self.state == SenderState.ARMED:
+            self._latch("the computer was suspended while armed; check the car, then reset the fault and arm again.")
 
     def main_lost(self) -> None:
         """Event: the main process has ended; the sender sends neutral and shuts down."""

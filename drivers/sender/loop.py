@@ -28,6 +28,8 @@ MAX_DECISION_AGE_S = 0.01
 """Largest age of a decision that may be written [s]; an older one means that the process was suspended in between."""
 MAX_DECISIONS = 3
 """Number of decisions in one tick after which neutral is written."""
+MIN_SUSPENSION_S = 0.05
+"""Shortest suspension of the computer that is noticed [s]; the clocks do not drift against each other."""
 HANDSHAKE_PERIOD_S = 0.1
 RECONNECT_PERIODS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
 LATENESS_WINDOW = 4096
@@ -71,6 +73,7 @@ class SenderLoop:
         self._deadlines = 0
         self._skipped = 0
         self._needs_version = False
+        self._suspended_s = _time_suspended_s()
 
     def run(self) -> None:
         """Connect and send until shutdown; always closes the device and publishes a last status.
@@ -156,6 +159,9 @@ class SenderLoop:
         if self._is_wake_open and not self._is_main_alive():
             self._is_wake_open = False
             self.logic.main_lost()
+        if (suspended_s := _time_suspended_s()) - self._suspended_s > MIN_SUSPENSION_S:
+            self._suspended_s = suspended_s
+            self.logic.resumed()
         self._take_order(now_s)
         self._receive(now_s)
         self._reconnect(now_s)
@@ -293,6 +299,14 @@ class SenderLoop:
             refusal=logic.refusal[:600],
         )
         self._statuses.write(status.pack())
+
+
+def _time_suspended_s() -> float:
+    """Time for which the computer has been suspended [s]; ``time.monotonic`` stands still meanwhile (Linux).
+
+    A pause of this process between the two readings makes it smaller, never larger.
+    """
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()
 
 
 def _known(value: float | None) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -47,11 +48,18 @@ class FakeDevice:
 class FakeTime:
     """The loop's clock."""
 
+    CLOCK_BOOTTIME = time.CLOCK_BOOTTIME
+
     def __init__(self) -> None:
         self.now_s = 100.0
+        self.suspended_s = 0.0
 
     def monotonic(self) -> float:
         return self.now_s
+
+    def clock_gettime(self, clock: int) -> float:
+        assert clock == self.CLOCK_BOOTTIME
+        return self.now_s + self.suspended_s
 
     def sleep(self, duration_s: float) -> None:
         self.now_s += duration_s
@@ -140,6 +148,21 @@ def test_stop_between_decision_and_write_takes_effect(bench: Bench) -> None:
     assert bench.device.written[-1] == CALIBRATION.neutral
     assert MOVING not in bench.device.written
     assert bench.loop.logic.state == SenderState.FAULT
+
+
+def test_command_before_a_suspension_of_the_computer_is_not_written(bench: Bench) -> None:
+    """The monotonic clock stands still while the computer is suspended, so the command is young."""
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == MOVING
+    bench.time.suspended_s += 3600.0
+    for _ in range(2):
+        bench.time.now_s += 0.001
+        bench.loop._tick(bench.time.now_s)
+        assert bench.device.written[-1] == CALIBRATION.neutral
+    assert "the computer was suspended" in bench.loop.logic.fault
+    bench.order(2, Request.RESET_FAULT, 0)
+    bench.loop._tick(bench.time.now_s)
+    assert bench.loop.logic.state == SenderState.CONNECTED
 
 
 def test_newer_command_between_decision_and_write_is_written(bench: Bench) -> None:
