@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import takewhile
+from statistics import median
 from typing import Self
 
 from carlab.core.errors import NotReadyError
@@ -24,8 +25,8 @@ HEIGHT_LIMIT_M = 0.3
 MAX_LATENCY_MS = 100.0
 """Largest median time from exposure to arrival [ms]: at 5 m/s a car drives half a metre in it."""
 RECENT_FRAMES = 60
-"""Number of newest frames in which tilted and invalid poses are counted: half a second at 120 Hz, so that a car that
-was carried can be armed soon after it stands level again."""
+"""Number of newest frames in which tilted, invalid and late poses are counted: half a second at 120 Hz, so that a car
+that was carried can be armed soon after it stands level again, and not while the network is congested."""
 RECENT_SHARE = 0.2
 """Share of the recent frames that may be tilted, or invalid, by single errors of tracking [1]."""
 
@@ -53,6 +54,7 @@ class RigidBodyPoseSource:
         self._tracked = self._untracked = self._missing = self._unusable = 0
         self._recent_tilted: deque[bool] = deque(maxlen=RECENT_FRAMES)
         self._recent_unusable: deque[bool] = deque(maxlen=RECENT_FRAMES)
+        self._recent_latency_ms: deque[float] = deque(maxlen=RECENT_FRAMES)
         self._low_m = [math.inf] * 3
         self._high_m = [-math.inf] * 3
 
@@ -143,13 +145,13 @@ class RigidBodyPoseSource:
                     f"more than {RECENT_SHARE:.0%} of the newest frames have an invalid pose of the body (NaN or no "
                     "unit quaternion); restart streaming in Motive."
                 )
+            if self._recent_latency_ms and median(self._recent_latency_ms) > MAX_LATENCY_MS:
+                found.append(
+                    f"the poses arrive more than {MAX_LATENCY_MS:g} ms after their exposure, too late to control a "
+                    "car; check the network and the load of Motive's computer."
+                )
         if not self._client.is_live:
             found.append("Motive is in Edit mode and streams a recorded take; switch it to Live mode.")
-        if self._client.statistics()["latency_p50_ms"] > MAX_LATENCY_MS:
-            found.append(
-                f"the poses arrive more than {MAX_LATENCY_MS:g} ms after their exposure, too late to control a car; "
-                "check the network and the load of Motive's computer."
-            )
         info = self._client.server_info
         has_clock = info is not None and info.clock_hz > 0
         if self._is_open and has_clock and not self._client.alignment.is_aligned:
@@ -213,6 +215,7 @@ class RigidBodyPoseSource:
                 return
             body = next((b for b in frame.rigid_bodies if self._body is not None and b.id == self._body.id), None)
             sample = self._sample(body, sequence, capture_s, received_s)
+            self._recent_latency_ms.append((received_s - capture_s) * 1e3)
             if sample is not None:
                 self._samples.append(sample)
                 self._new_sample.notify_all()

@@ -50,6 +50,17 @@ def test_late_poses_are_a_problem(serve: Serve, configure: Configure, until: Unt
         assert source.problems() == ()
 
 
+def test_poses_that_have_become_late_are_a_problem_at_once(serve: Serve, configure: Configure, until: Until) -> None:
+    server = serve()
+    with RigidBodyPoseSource(configure(server)) as source:
+        until(lambda: source.statistics()["frames"] >= 600)
+        assert source.problems() == ()
+        frames = source.statistics()["frames"]
+        server.faults = ServerFaults(latency_s=0.3)
+        until(lambda: "after their exposure" in "".join(source.problems()))
+        assert source.statistics()["frames"] - frames < 300
+
+
 def test_frames_that_are_being_recorded_are_live() -> None:
     client = NatNetClient(MocapConfig())
     client.server_mode = ServerMode.RECORDING_OR_EDIT
