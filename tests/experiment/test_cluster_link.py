@@ -92,8 +92,8 @@ def token(monkeypatch: pytest.MonkeyPatch) -> None:
 def cluster_of_ray(tmp_path: Path) -> Iterator[Cluster]:
     pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[ray]'")
     ports = {name: free_port() for name in ("port", "ray-client-server-port", "dashboard-agent-listen-port")}
-    command = ["ray", "start", "--head", "--block", "--num-cpus=2", "--node-ip-address=127.0.0.1"]
-    command += ["--include-dashboard=false", "--disable-usage-stats"]
+    command = [str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--num-cpus=2"]
+    command += ["--node-ip-address=127.0.0.1", "--include-dashboard=false", "--disable-usage-stats"]
     command += [f"--{name}={port}" for name, port in ports.items()]
     settings = LinkSettings(wait_s=40.0, lost_wait_s=25.0, message_s=2.0, reconnect_s=20.0, pause_s=0.5)
     with process_group(command) as head:

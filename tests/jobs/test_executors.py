@@ -139,7 +139,7 @@ def test_lost_cluster_ends_the_command_with_the_remedy(cluster: RayExecutor, mon
         raise ConnectionError("the channel is closed")
 
     monkeypatch.setattr(cluster._ray, "wait", wait)
-    with pytest.raises(DataError, match=r"does not answer any more \(the channel is closed\); finished cases are kept"):
+    with pytest.raises(DataError, match=r"does not answer any more \(the channel is closed\); finished cases are"):
         cluster.run(ChildJob((PYTHON, "-c", ""), 60.0), never)
 
 
