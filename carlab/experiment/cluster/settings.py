@@ -14,12 +14,12 @@ class LinkSettings:
     Attributes:
         wait_s: time without an answer after which a training runs on this computer [s]; a training takes about a
             minute.
-        connect_s: time for the first connection [s], before the car is opened; Ray takes 10 to 20 s.
+        connect_s: time for a connection [s]; Ray takes 10 to 20 s, and longer on a busy cluster.
         lost_wait_s: the same for a cluster that did not answer the last time [s], so that a run without a cluster is
             delayed little; a connection takes 5 to 10 s.
         message_s: time without an answer after which the run prints that it waits [s]; longer than a connection takes.
-        reconnect_s: time without an answer after which the connection is opened again [s], because a dead link gives no
-            error; longer than the transfer of one file takes.
+        reconnect_s: time without an answer after which an open connection is opened again [s], because a dead link
+            gives no error; longer than the transfer of one file takes.
         pause_s: pause before a refused connection is tried again [s].
         poll_s: time between two questions for the state of the training [s].
         max_lost_workers: lost workers of one training after which it runs on this computer; a training that needs too

@@ -153,6 +153,7 @@ class _Waiting:
             self._wait_s = min(self._wait_s, self._settings.lost_wait_s)
         self._answered_s = trainer.clock.now_s()
         self._sent_s = self._answered_s
+        self._is_connecting = trainer.is_lost
         self._retry_s: float | None = None
         self._is_announced = False
         self._n_lost_workers = 0
@@ -179,7 +180,9 @@ class _Waiting:
 
     def _on_event(self, event: LinkEvent) -> None:
         now_s = self._trainer.clock.now_s()
-        if event.kind == "answer":
+        if event.kind == "connected":
+            self._sent_s, self._is_connecting = now_s, False
+        elif event.kind == "answer":
             self._on_answer(event)
         elif event.kind == "failed":
             raise DataError(event.message)
@@ -221,11 +224,12 @@ class _Waiting:
                 f"The cluster {self._trainer.address} has not answered for {self._settings.message_s:.0f} s. The car "
                 f"stays in neutral; the run waits up to {self._wait_s:.0f} s, then it trains on this computer."
             )
-        is_dead = now_s - self._sent_s > self._settings.reconnect_s
+        limit_s = self._settings.connect_s if self._is_connecting else self._settings.reconnect_s
+        is_dead = now_s - self._sent_s > limit_s
         if is_dead or (self._retry_s is not None and now_s >= self._retry_s):
             self._trainer.link.cut()
             self._trainer.link.send(self._request)
-            self._sent_s, self._retry_s = now_s, None
+            self._sent_s, self._retry_s, self._is_connecting = now_s, None, True
 
 
 def _files_of(order: TrainingOrder) -> dict[str, bytes]:
