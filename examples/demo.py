@@ -64,7 +64,7 @@ def main() -> None:
     options = parser.parse_args()
 
     nominal = carlab.load_car("sim")
-    reality = CarFile("reality", "", nominal.simulator.with_values(CONCEALED), None)
+    reality = nominal.with_values(CONCEALED)
     print(f"Learning to park in {options.episodes} episodes ({options.car} car; it differs from its car file)")
     learned = carlab.learn(
         options.car, reality=reality, episodes=options.episodes, updates=options.updates,

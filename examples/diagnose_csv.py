@@ -9,7 +9,6 @@ import math
 from pathlib import Path
 
 import carlab
-from carlab.cars import CarFile
 from carlab.core.geofence import rectangle
 from carlab.core.manoeuvres import Manoeuvre
 from carlab.core.task import RecordedTask
@@ -22,10 +21,9 @@ def example_csv(folder: Path, seconds: float) -> Path:
     def steps(t_s: float) -> carlab.Action:
         return carlab.Action(math.copysign(0.6, math.sin(2.1 * t_s)), 0.3 + 0.15 * math.sin(0.5 * t_s))
 
-    simulator = carlab.load_car("sim").simulator.with_values({"effects.steering_lag.time_constant": 0.09})
     run = carlab.drive(
         "sim",
-        reality=CarFile("reality", "", simulator, None),
+        reality=carlab.load_car("sim").with_values({"effects.steering_lag.time_constant": 0.09}),
         policy=ManoeuvrePolicy(Manoeuvre("steps", seconds, steps)),
         task=RecordedTask(carlab.CarState(), max_ticks=int(30 * seconds), arena_m=rectangle(-60.0, 60.0, -60.0, 60.0)),
         out=folder,

@@ -8,6 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import as_polygon
 from carlab.core.recording_noise import RecordingNoise
@@ -38,7 +40,16 @@ class RealCar:
 
 @dataclass(frozen=True, slots=True)
 class CarFile:
-    """A car file: text, simulator, and where the file has them the real car, the noise and the track."""
+    """A car file: a simulator, and where the file has them the real car, the noise and the track.
+
+    Attributes:
+        name: of the car, for messages.
+        text: TOML; if it is empty, that of the simulator.
+        simulator: parameters and effects in SI units.
+        real: contents of ``[hardware]``; None for a simulated car.
+        recording_noise: noise that a diagnosis measured; None if the file does not state it.
+        track: closed track for ``laps``; None if the file does not state it.
+    """
 
     name: str
     text: str
@@ -46,6 +57,24 @@ class CarFile:
     real: RealCar | None
     recording_noise: RecordingNoise | None = None
     track: Track | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", self.text or tomli_w.dumps(self.simulator.to_tables()))
+
+    def with_values(self, changes: Mapping[str, float]) -> CarFile:
+        """Simulated car with changed numbers, for example as ``reality`` of ``carlab.drive``.
+
+        Args:
+            changes: numbers by dotted name, such as ``motor.drive_gain`` or ``effects.steering_lag.time_constant``; an
+                effect with a number is added.
+
+        Returns:
+            A car file without ``[hardware]``, measured noise and track.
+
+        Raises:
+            ConfigError: an unknown name, or an impossible value.
+        """
+        return CarFile(self.name, "", self.simulator.with_values(changes), None)
 
     def __repr__(self) -> str:
         """One line: name, kind of vehicle model, and whether the file has ``[hardware]``."""
@@ -56,11 +85,9 @@ class CarFile:
 
         Raises DataError if it cannot be written.
         """
-        import tomli_w
-
         from carlab.recording.atomic_files import write_text
 
-        write_text(Path(path), self.text or tomli_w.dumps(self.simulator.to_tables()))
+        write_text(Path(path), self.text)
         return Path(path)
 
 

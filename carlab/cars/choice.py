@@ -192,9 +192,7 @@ def _name_of(car: str | Path | CarFile) -> str:
 
 
 def _config_toml(file: CarFile, car: str) -> str:
-    import tomli_w
-
-    return f"# --car {car}\n" + (file.text or tomli_w.dumps(file.simulator.to_tables()))
+    return f"# --car {car}\n{file.text}"
 
 
 def _simulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
