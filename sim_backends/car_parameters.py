@@ -81,7 +81,7 @@ class SimulatorConfig:
     def __post_init__(self) -> None:
         if self.kind not in MODEL_KINDS:
             raise ConfigError(f"kind is {self.kind!r} in [model]; it must be one of {', '.join(MODEL_KINDS)}.")
-        check_keys(self.effects, EFFECTS, "[effects]")
+        _check_effects(self.effects, "[effects]")
         check_keys(self.priors, REGISTRY, "the priors")
         complete = {}
         for effect_id, given in self.effects.items():
@@ -129,7 +129,7 @@ class SimulatorConfig:
         Raises:
             ConfigError: an unknown name, or an impossible value.
         """
-        check_keys(changes, REGISTRY, "the parameters")
+        _check_names(changes)
         grouped: dict[str, dict[str, Any]] = {"parameters": {}, "mocap": {}, "timing": {}}
         effects = {effect_id: dict(given) for effect_id, given in self.effects.items()}
         for name, value in changes.items():
@@ -248,6 +248,25 @@ def _table(tables: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any
     return table
 
 
+def _check_effects(effects: Mapping[str, Any], where: str) -> None:
+    """Raise ConfigError for the first effect that is not registered in this process."""
+    try:
+        check_keys(effects, EFFECTS, where)
+    except ConfigError as error:
+        raise ConfigError(f"{error} Register an effect of your own at the top level of your script.") from None
+
+
+def _check_names(changes: Mapping[str, Any]) -> None:
+    """Raise ConfigError for the first unknown dotted name, with the nearest name of the same table."""
+    for name in changes:
+        table, _, key = name.rpartition(".")
+        if known := section(table):
+            check_keys({key: None}, known, f"[{table}]")
+        else:
+            inside = [other for other in REGISTRY if other.startswith(f"{name}.")]
+            check_keys({name: None}, inside or REGISTRY, "the parameters")
+
+
 def _sections(tables: Mapping[str, Any], where: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     for name in ("vehicle", "motor", "steering", "timing", "mocap"):
         yield name, _table(tables, name, where)
@@ -256,7 +275,7 @@ def _sections(tables: Mapping[str, Any], where: str) -> Iterator[tuple[str, Mapp
     for axle in tyre:
         yield f"tyre.{axle}", _table(tyre, axle, f"[tyre] of {where}")
     effects = _table(tables, "effects", where)
-    check_keys(effects, EFFECTS, f"[effects] of {where}")
+    _check_effects(effects, f"[effects] of {where}")
     for effect_id in effects:
         table = _table(effects, effect_id, f"[effects] of {where}")
         effect = EFFECTS[effect_id]

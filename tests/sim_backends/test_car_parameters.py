@@ -120,8 +120,26 @@ def test_values_by_dotted_name_cover_the_registry_and_can_be_changed():
     assert SimulatorConfig().with_values({"effects.motor_lag.time_constant": 0.2}).effects == {
         "motor_lag": {"time_constant": 0.2}
     }
-    with pytest.raises(ConfigError, match=r"tyre\.front\.mu"):
-        config.with_values({"tyre.front.muu": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("tyre.front.muu", "Unknown key 'muu' in [tyre.front]; did you mean 'mu'?"),
+        ("motor.gain", "Unknown key 'gain' in [motor]; did you mean 'drive_gain'?"),
+        ("effects.steering_lag.tau", "Unknown key 'tau' in [effects.steering_lag]; known keys: time_constant."),
+        ("effects.steering_lag", "did you mean 'effects.steering_lag.time_constant'?"),
+        ("mass", "did you mean 'vehicle.mass'?"),
+    ],
+)
+def test_unknown_name_is_refused_with_the_nearest_name_of_its_table(name, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        SimulatorConfig().with_values({"vehicle.mass": 2.0, name: 0.5})
+
+
+def test_effect_that_is_not_registered_is_refused_with_the_remedy():
+    with pytest.raises(ConfigError, match=r"'cubic_drag' in \[effects\].* Register an effect of your own at the top"):
+        SimulatorConfig.from_tables({"effects": {"cubic_drag": {"coefficient": 0.5}}})
 
 
 def test_latency_effect_without_a_number_uses_the_car_file():
