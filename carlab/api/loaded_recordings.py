@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from carlab.api.recordings import Recording, is_csv, required_file
 from carlab.core.errors import ConfigError
@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import DataFault, RecordingUse
 
-RecordingLike = Any
+Given: TypeAlias = "Recording | EpisodeData | Path"
+RecordingLike: TypeAlias = "Given | str"
 """A Recording, an EpisodeData, or the path of an MCAP, a CSV or a run's folder."""
 REPORTED_FAULTS = (
     *("yaw_wrap_spikes", "outliers", "stale_samples", "clock_drift", "column_shift", "column_scale"),
@@ -37,7 +38,7 @@ class LoadedRecordings:
     notes: list[str] = field(default_factory=list)
 
 
-def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:
+def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[Given]:
     """Recordings as a list, with strings converted to paths. Raises ConfigError for another type."""
     from carlab.core.episode_data import EpisodeData
     from carlab.core.errors import ConfigError
@@ -53,16 +54,14 @@ def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLik
     return [Path(item) if isinstance(item, str) else item for item in items]
 
 
-def assigned(
-    recordings: list[RecordingLike], held_out: list[RecordingLike]
-) -> tuple[list[RecordingLike], list[RecordingLike]]:
+def assigned(recordings: list[Given], held_out: list[Given]) -> tuple[list[Given], list[Given]]:
     """Recordings to fit and to hold out, with run folders resolved. Raises ConfigError if one is both."""
     if not recordings:
         raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
-    to_fit: list[RecordingLike] = []
+    to_fit: list[Given] = []
     to_validate = list(held_out)
     for item in recordings:
-        fitted, validated = _episodes_of_run(item) if isinstance(item, Path) else ([item], [])
+        fitted, validated = _episodes_of_run(item)
         to_fit += fitted
         to_validate += validated
     if same := _paths_of(to_fit) & _paths_of(to_validate):
@@ -71,13 +70,11 @@ def assigned(
     return to_fit, to_validate
 
 
-def recordings_of_runs(
-    first: list[RecordingLike], second: list[RecordingLike]
-) -> tuple[list[RecordingLike], list[RecordingLike]]:
+def recordings_of_runs(first: list[Given], second: list[Given]) -> tuple[list[Given], list[Given]]:
     """Two groups with run folders replaced by their episodes. Raises ConfigError if a recording is in both."""
-    groups: list[list[RecordingLike]] = []
+    groups: list[list[Given]] = []
     for items in (first, second):
-        resolved = [_episodes_of_run(item) if isinstance(item, Path) else ([item], []) for item in items]
+        resolved = [_episodes_of_run(item) for item in items]
         groups.append([recording for fitted, validated in resolved for recording in (*fitted, *validated)])
     if same := _paths_of(groups[0]) & _paths_of(groups[1]):
         raise ConfigError(f"{min(same).name} is in both groups; remove it from one of them.")
@@ -86,7 +83,7 @@ def recordings_of_runs(
     return groups[0], groups[1]
 
 
-def _check_repetition(items: Iterable[RecordingLike]) -> None:
+def _check_repetition(items: Iterable[Given]) -> None:
     """Raise ConfigError if a file is given twice, for example by itself and by its run folder."""
     known: set[Path] = set()
     for path in (_path_of(item) for item in items):
@@ -104,27 +101,27 @@ def check_contents(uses: Iterable[RecordingUse]) -> None:
         known[use.sha256] = use.path
 
 
-def _paths_of(items: Iterable[RecordingLike]) -> set[Path]:
+def _paths_of(items: Iterable[Given]) -> set[Path]:
     return {path.resolve() for item in items if (path := _path_of(item))}
 
 
-def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
-    """Episodes of a run folder to fit and to hold out (every third); for other paths the path itself, to fit."""
-    if not (path / "episodes").is_dir():
-        return [path], []
+def _episodes_of_run(item: Given) -> tuple[Sequence[Given], Sequence[Given]]:
+    """Episodes of a run folder to fit and to hold out (every third); for others the recording itself, to fit."""
+    if not isinstance(item, Path) or not (item / "episodes").is_dir():
+        return [item], []
     from carlab.recording.mcap.source import has_ticks
 
-    driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]
+    driven = [recording for recording in sorted((item / "episodes").glob("*.mcap")) if has_ticks(recording)]
     if not driven:
-        raise ConfigError(f"{path} has no finished episode; drive one first.")
+        raise ConfigError(f"{item} has no finished episode; drive one first.")
     return [p for k, p in enumerate(driven) if k % 3 != 2], driven[2::3]
 
 
-def _path_of(item: RecordingLike) -> Path | None:
+def _path_of(item: Given) -> Path | None:
     return item.path if isinstance(item, Recording) else item if isinstance(item, Path) else None
 
 
-def load_recordings(items: list[RecordingLike], role: str, latency_s: float) -> LoadedRecordings:
+def load_recordings(items: list[Given], role: str, latency_s: float) -> LoadedRecordings:
     """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
     loaded = LoadedRecordings()
     for item in items:
@@ -133,18 +130,19 @@ def load_recordings(items: list[RecordingLike], role: str, latency_s: float) -> 
     return loaded
 
 
-def _read_item(item: RecordingLike, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
+def _read_item(item: Given, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
     """Add the episodes of one recording."""
     from carlab.api.recordings import load
+    from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import RecordingUse
     from carlab.diagnosis.state_alignment import align_states
 
-    path = _path_of(item)
-    if path is None:
-        _check_times(item)
+    if isinstance(item, EpisodeData):
+        _check_arrays(item)
         loaded.episodes.append(align_states(item, latency_s))
         digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
         return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
+    path = item.path if isinstance(item, Recording) else item
     if is_csv(required_file(path)):
         _read_csv(path, item.mapping if isinstance(item, Recording) else None, loaded)
     else:
@@ -155,17 +153,22 @@ def _read_item(item: RecordingLike, role: str, latency_s: float, loaded: LoadedR
     return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
 
 
-def _check_times(episode: EpisodeData) -> None:
-    """Raise DataError if the times of an episode do not increase, or are not in seconds."""
+def _check_arrays(episode: EpisodeData) -> None:
+    """Raise DataError if the times of an episode do not increase or are not in seconds, or if a command is above 1."""
     import numpy as np
 
     from carlab.core.errors import DataError
-    from carlab.recording.audit.file_checks import MAX_PERIOD_S
+    from carlab.recording.audit.file_checks import MAX_COMMAND, MAX_PERIOD_S
 
     if not np.all(np.diff(episode.times_s) > 0.0):
         raise DataError("times_s of an EpisodeData does not increase from row to row; sort the rows.")
     if episode.period_s > MAX_PERIOD_S:
         raise DataError(f"The rows of an EpisodeData are {episode.period_s:.4g} s apart; give times_s in seconds.")
+    if (largest := float(np.abs(episode.sent).max(initial=0.0))) > MAX_COMMAND:
+        raise DataError(
+            f"sent of an EpisodeData reaches {largest:.4g} where commands lie in [-1, 1]; divide steering and throttle "
+            "by their full command."
+        )
 
 
 def _read_csv(path: Path, mapping: Any, loaded: LoadedRecordings) -> None:

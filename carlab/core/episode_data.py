@@ -18,15 +18,15 @@ class EpisodeData:
     Attributes:
         times_s: time of each observation on the recording's clock [s] (T + 1,).
         states: x, y [m], yaw [rad] of base_link in map; vx, vy [m/s], yaw rate [rad/s] in the body frame (T + 1, 6).
-        requested: steering, throttle requested by the policy (T, 2).
-        sent: steering, throttle sent by the safety gate (T, 2).
+        requested: steering, throttle requested by the policy (T, 2); those of ``sent`` if it is unknown.
+        sent: steering, throttle sent by the safety gate (T, 2), in [-1, 1].
         rewards: reward of each transition (T,); NaN if the recording has none.
         poses: raw motion capture: capture time [s], x, y [m], yaw [rad] (P, 4); P may be 0.
         metadata: texts: car, reality, policy, task, seed, end_reason, end_detail, units ...
         extra: further columns of a file by name, each (T + 1,).
 
     Raises:
-        DataError: an array has another shape.
+        DataError: an array has another shape, or is no NumPy array.
     """
 
     times_s: FloatArray
@@ -39,6 +39,9 @@ class EpisodeData:
     extra: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in ("times_s", "states", "requested", "sent", "rewards"):
+            if not isinstance(given := getattr(self, name), np.ndarray):
+                raise DataError(f"{name} has the type {type(given).__name__}; give a NumPy array.")
         ticks = self.sent.shape[0]
         shapes = {
             "times_s": (self.times_s.shape, (ticks + 1,)),

@@ -37,6 +37,19 @@ def test_load_reads_only_files() -> None:
         carlab.load(np.zeros((10, 9)))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("name", ["times_s", "states", "requested", "sent", "rewards"])
+def test_other_arrays_than_those_of_numpy_are_refused(episode: EpisodeData, name: str) -> None:
+    with pytest.raises(DataError, match=f"{name} has the type list; give a NumPy array"):
+        replace(episode, **{name: getattr(episode, name).tolist()})
+
+
+def test_commands_in_other_units_are_refused_as_in_a_csv(episode: EpisodeData) -> None:
+    percent = replace(episode, sent=100.0 * episode.sent)
+    for call in (carlab.predict, carlab.diagnose):
+        with pytest.raises(DataError, match=r"reaches 10 where commands lie in \[-1, 1\]; divide steering"):
+            call(percent, "sim")
+
+
 @pytest.mark.parametrize(("factor", "message"), [(1000.0, "33.33 s apart; give times_s in seconds"), (0.0, "sort")])
 def test_times_increase_and_are_in_seconds(episode: EpisodeData, factor: float, message: str) -> None:
     with pytest.raises(DataError, match=message):
