@@ -23,11 +23,9 @@ def load_car(car: str | Path | CarFile = "sim") -> CarFile:
     Raises:
         ConfigError: the file does not exist or is invalid.
     """
-    from carlab.cars import CarFile, default_car, load_car_file
+    from carlab.cars import default_car, read_car
 
-    if isinstance(car, CarFile):
-        return car
-    return default_car() if str(car) == "sim" else load_car_file(Path(car))
+    return default_car() if car in ("sim", Path("sim")) else read_car(car)
 
 
 def car_options_text(

@@ -108,7 +108,7 @@ def drive(
 
 
 def replay(
-    recording: Path | str | Recording,
+    recording: Path | str | Recording | EpisodeData,
     car: str | Path | CarFile = "sim",
     *,
     seconds: float | None = None,
@@ -122,7 +122,7 @@ def replay(
     """Put a car at the start of a recording, send the recorded actions at their times, and record the drive.
 
     Args:
-        recording: an MCAP or CSV file, or a loaded recording; its longest episode is replayed.
+        recording: an MCAP or CSV file, or a loaded recording, whose longest episode is replayed; or an episode.
         car: as for ``drive``. The arena of an emulated or simulated car extends 20 m beyond the recording by default.
         seconds: duration of the replay [s]; by default the whole recording.
         seed: of sensor noise.
@@ -141,12 +141,16 @@ def replay(
     """
     from carlab.api.recordings import Recording, load
     from carlab.cars import choose_car
+    from carlab.core.episode_data import EpisodeData
     from carlab.experiment.episodes.scripted_policies import ReplayPolicy
 
     above_zero(seconds=seconds)
     valid_seed(seed=seed)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
-    episode = (recording if isinstance(recording, Recording) else load(recording)).episode
+    if isinstance(recording, EpisodeData):
+        episode = recording
+    else:
+        episode = (recording if isinstance(recording, Recording) else load(recording)).episode
     run = drive(
         car,
         policy=ReplayPolicy(episode.times_s[:-1], episode.sent),

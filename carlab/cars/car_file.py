@@ -91,6 +91,21 @@ class CarFile:
         return Path(path)
 
 
+def read_car(car: str | Path | CarFile, option: str = "--car") -> CarFile:
+    """Return a car file unchanged, or read one by its path or the name of a preset.
+
+    Raises ConfigError as ``load_car_file``, and for an object of another type; the message names ``option``.
+    """
+    if isinstance(car, CarFile):
+        return car
+    if not isinstance(car, (str, Path)):
+        raise ConfigError(
+            f"{option}: an object of type {type(car).__name__} is no car; give a name, the path of a car file, or the "
+            "result of carlab.load_car."
+        )
+    return load_car_file(Path(car))
+
+
 def load_car_file(path: Path) -> CarFile:
     """Read a car file, or a preset by its bare name (``preset_names``).
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from carlab.cars.car_file import CarFile, default_car, is_preset, load_car_file
+from carlab.cars.car_file import CarFile, default_car, is_preset, read_car
 from carlab.core.car import Car
 from carlab.core.errors import CarlabError, ConfigError
 from carlab.core.geofence import stopping_distance_m
@@ -94,14 +94,14 @@ def choose_car(
 def _choose(
     name: str | Path | CarFile, vehicle: str | Path | CarFile | None, reality: str | Path | CarFile | None, seed: int
 ) -> CarChoice:
-    truth = None if reality is None else _read(reality, "--reality").simulator
+    truth = None if reality is None else read_car(reality, "--reality").simulator
     plugins = {point.name: point for point in importlib.metadata.entry_points(group=PLUGIN_GROUP)}
     if isinstance(name, str) and name in BUILT_IN:
-        return BUILT_IN[name](default_car() if vehicle is None else _read(vehicle, "--vehicle"), seed, truth)
+        return BUILT_IN[name](default_car() if vehicle is None else read_car(vehicle, "--vehicle"), seed, truth)
     if isinstance(name, str) and name in plugins:
         if truth is not None:
             raise ConfigError(f"--reality needs a simulated or emulated car; '{name}' is a plug-in. Remove --reality.")
-        return _from_plugin(plugins[name], default_car() if vehicle is None else _read(vehicle, "--vehicle"), seed)
+        return _from_plugin(plugins[name], default_car() if vehicle is None else read_car(vehicle, "--vehicle"), seed)
     if vehicle is not None:
         raise ConfigError(f"--vehicle needs --car sim or emulated; '{_name_of(name)}' has its own physics.")
     if isinstance(name, str):
@@ -111,7 +111,7 @@ def _choose(
                 f"There is no car '{name}'; name one of {', '.join([*BUILT_IN, *plugins, *preset_names()])}, "
                 "or a FILE.toml."
             )
-    file = _read(name, "--car")
+    file = read_car(name)
     if file.real is None:
         return _simulated(file, seed, truth)
     if truth is not None:
@@ -177,14 +177,6 @@ def _warn_of_coasting(choice: CarChoice) -> None:
             speed_mps[worst],
             assumed_m[worst],
         )
-
-
-def _read(car: str | Path | CarFile, option: str) -> CarFile:
-    if isinstance(car, CarFile):
-        return car
-    if not isinstance(car, (str, Path)):
-        raise ConfigError(f"{option} {car!r}: give the path of a car file, a preset, or a car file that was read.")
-    return load_car_file(Path(car))
 
 
 def _name_of(car: str | Path | CarFile) -> str:

@@ -40,5 +40,18 @@ def test_strings_are_accepted_by_the_other_calls(tmp_path: Path, car_file: Path)
 @pytest.mark.parametrize("option", ["car", "vehicle", "reality"])
 def test_value_of_another_type_is_refused(tmp_path: Path, option: str) -> None:
     arguments: dict[str, Any] = {"car": "sim"} | {option: 5}
-    with pytest.raises(ConfigError, match=f"--{option} 5: give the path of a car file"):
+    with pytest.raises(ConfigError, match=f"--{option}: an object of type int is no car; give a name"):
         carlab.drive(**arguments, ticks=2, out=tmp_path)
+
+
+def test_simulator_of_a_car_file_is_no_car() -> None:
+    simulator: Any = carlab.load_car().simulator
+    with pytest.raises(ConfigError, match=r"type SimulatorConfig is no car; .* the result of carlab.load_car"):
+        carlab.predict("drive.mcap", simulator)
+
+
+def test_episode_of_a_run_is_replayed(tmp_path: Path) -> None:
+    run = carlab.drive(policy="neutral", ticks=5, out=tmp_path, rerun=False, picture=False)
+    recorded, replayed = carlab.replay(run.episodes[0].data, out=tmp_path)
+    assert recorded is run.episodes[0].data
+    assert replayed.episodes[0].data.ticks == 5
