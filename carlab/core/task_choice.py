@@ -106,6 +106,8 @@ def choose_task(task: str | Task, track: Track | None = None) -> TaskChoice:
         task: the task.
         track: for ``laps``; None: the default oval.
     """
+    if isinstance(task, type):
+        raise ConfigError(f"--task {task.__name__}: it is a class; give an object of it, {task.__name__}(...).")
     if not isinstance(task, str):
         return TaskChoice(type(task).__name__, sha256=_source_sha256(type(task)), given=task)
     if track is not None and task != "laps":

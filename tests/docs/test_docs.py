@@ -17,7 +17,11 @@ import pytest
 from carlab.cars import load_car_file
 from carlab.cli import _verbs, run
 from carlab.core.car import Car
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import CarState, Observation
 from carlab.core.safety import SafetyEnvelope
+from carlab.diagnosis.findings import EffectFinding, Estimate, FitErrors
+from carlab.experiment.episodes.session import EpisodeResult
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from mocap.config import MocapConfig
@@ -131,13 +135,15 @@ def test_unchanged_commands_of_a_page_run_in_order(
 
 
 def run_commands_of(page: Path, capfd: pytest.CaptureFixture[str], added: Mapping[str, tuple[str, ...]]) -> None:
-    """Run the commands of a page in this process, which spares its imports, and in the current folder.
+    """Run the commands of a page in this process, which spares its imports, and its scripts, in the current folder.
 
     Patterns of the shell are expanded, and ``added`` arguments of a verb are appended.
     """
     for block in blocks(page):
         if block.marker == "file":
             Path(block.note).write_text(block.text, encoding="utf-8")
+        if block.marker == "run" and block.language == "python":
+            subprocess.run([sys.executable, "-c", block.text], check=True)
         if block.marker != "run":
             continue
         for command in (line[2:] for line in block.text.split("\n") if line.startswith("$ ")):
@@ -241,6 +247,9 @@ def test_site_builds_without_warnings(tmp_path: Path) -> None:
         "M -= coefficient r",
     ):
         assert equation in effects
+    api = (reference / "api.html").read_text(encoding="utf-8")
+    for cls in (CarState, Observation, PolicyInput, EffectFinding, Estimate, FitErrors, EpisodeResult):
+        assert [field.name for field in dataclasses.fields(cls) if f">{field.name}<" not in api] == []
     car_file = (reference / "car-file.html").read_text(encoding="utf-8")
     for table in (ActuatorConfig, ActuatorCalibration, MocapConfig, SafetyEnvelope):
         for key in {field.name for field in dataclasses.fields(table)} - {"arena_m"}:

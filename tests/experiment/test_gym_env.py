@@ -10,7 +10,10 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import carlab.experiment.episodes.gym_registration  # noqa: F401
-from carlab.experiment.episodes.gym_env import CarEnv
+from carlab.cars import default_car
+from carlab.core.errors import ConfigError
+from carlab.core.task import ParkingTask
+from carlab.experiment.episodes.gym_env import CarEnv, make_env
 
 
 @pytest.fixture(params=["carlab/Parking-v0", "carlab/Path-v0"])
@@ -83,3 +86,23 @@ def test_step_before_reset_is_refused() -> None:
     assert isinstance(env, CarEnv)
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros(2, dtype=np.float32))
+
+
+def test_environment_of_a_task_object_and_a_car_file() -> None:
+    task = ParkingTask(max_ticks=7, stop_when_parked=True)
+    env = make_env(task, vehicle=default_car().with_values({"timing.control_period": 0.05}))
+    gymnasium_check(env, skip_render_check=True)
+    env.reset(seed=0)
+    steps = 1
+    while not env.step(np.zeros(2, dtype=np.float32))[3]:
+        steps += 1
+    assert steps == task.at_period(0.05).max_ticks
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "message"), [("drift", "--task drift: choose one of"), (ParkingTask, "it is a class")]
+)
+def test_unknown_task_is_refused(task: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_env(task)  # type: ignore[arg-type]

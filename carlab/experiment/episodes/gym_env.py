@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,7 +22,10 @@ from carlab.core.observation import STATE_FEATURES, ActionHistory, encode, featu
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, FloatArray, Observation, Reality
 from carlab.core.task import Task
-from carlab.core.task_choice import TASKS
+from carlab.core.task_choice import choose_task
+
+if TYPE_CHECKING:
+    from carlab.cars import CarFile
 
 # Bounds of the observation space, beyond the range of a car of this size; observations are clipped to them.
 STATE_BOUNDS = np.array([20.0, 20.0, 1.0, 1.0, 20.0, 20.0, 60.0])
@@ -137,13 +140,20 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return info
 
 
-def make_env(task: str = "parking", vehicle: str | Path | None = None) -> CarEnv:
-    """Create the environment of a task by name; ``vehicle`` is a car file, by default the default car's."""
+def make_env(task: str | Task = "parking", vehicle: str | Path | CarFile | None = None) -> CarEnv:
+    """Create the environment of a task and a simulated car.
+
+    Args:
+        task: name, FILE.py:CLASS, or an object.
+        vehicle: car file; None: the default car.
+
+    Raises:
+        ConfigError: an unknown task, or an error in the task or in the car file.
+    """
     from carlab.cars import choose_car
 
     def car_of_seed(seed: int) -> Car:
-        return choose_car("sim", vehicle=None if vehicle is None else Path(vehicle), seed=seed).car
+        return choose_car("sim", vehicle=vehicle, seed=seed).car
 
-    period_s = choose_car("sim", vehicle=None if vehicle is None else Path(vehicle), seed=0).control_period_s
-    chosen_task: Task = TASKS[task]().at_period(period_s)
-    return CarEnv(car_of_seed, chosen_task, period_s)
+    period_s = choose_car("sim", vehicle=vehicle).control_period_s
+    return CarEnv(car_of_seed, choose_task(task).load().at_period(period_s), period_s)
