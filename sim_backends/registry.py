@@ -102,7 +102,7 @@ def register(effect: Effect) -> None:
     """Add an effect to car files, all engines, the diagnosis, its reports, and the prior of learning.
 
     Raises:
-        ConfigError: its id exists, or it has no parameters or lacks a method.
+        ConfigError: its id exists, it has no parameters, it lacks a method, or it changes nothing.
     """
     if effect.id in EFFECTS:
         raise ConfigError(f"There is an effect '{effect.id}' already; choose another id for the new effect.")
@@ -111,10 +111,21 @@ def register(effect: Effect) -> None:
     method = effect.required_method()
     if method and getattr(type(effect), method).__module__ == Effect.__module__:
         raise ConfigError(f"Effect '{effect.id}' has no method '{method}'; define it in the class of the effect.")
+    _check_equation(effect)
     EFFECTS[effect.id] = effect
     if effect.catalogued:
         CATALOGUE[effect.id] = effect
     REGISTRY.update(_numbers_of(effect))
+
+
+def _check_equation(effect: Effect) -> None:
+    """Raise ConfigError if the class of an effect overrides no method of its base class."""
+    base = next(cls for cls in type(effect).__mro__ if cls.__module__ == Effect.__module__)
+    methods = [name for name, method in vars(base).items() if callable(method) and name != "required_method"]
+    if methods and all(getattr(type(effect), name) is getattr(base, name) for name in methods):
+        raise ConfigError(
+            f"Effect '{effect.id}' changes nothing; define at least one of the methods {', '.join(methods)}."
+        )
 
 
 @contextlib.contextmanager

@@ -12,6 +12,8 @@ from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from carlab.core.errors import ConfigError
+
 
 @dataclass(eq=False, slots=True)
 class Node:
@@ -58,6 +60,15 @@ class Node:
 
     def __ge__(self, other: Any) -> Any:
         return self.tracer.make("less_equal", other, self)
+
+    def _refuse(self, *_: Any) -> Any:
+        """Raise ConfigError for a branch or a function of Python, which would act on the node and not on its number."""
+        raise ConfigError(
+            "An equation of an effect has if, and, or, not, **, abs or a function of math; use ops.where, ops.pow, "
+            "ops.abs, ops.sin ... (sim_backends.array_ops)."
+        )
+
+    __bool__ = __float__ = __pow__ = __rpow__ = __abs__ = _refuse
 
 
 _FOLD: dict[str, Callable[..., float]] = {
