@@ -156,7 +156,7 @@ def learn(
             ``sim-fsvgd-corrected`` and ``fsvgd`` are the paper's algorithms with its settings.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
         model_steps: optimiser steps of the model before each episode; 2500 by default.
-        updates: gradient steps of the policy before an episode; 30 000 by default.
+        updates: SAC gradient steps; 30 000 by default. 1.5 times as many before episode 1, 3 / episode after episode 3.
         seed: of all random numbers; 0 by default.
         device: of the training of model and policy; ``cpu`` by default.
         place: True, the default: start each episode at the task's start pose; False: at the car's current pose.
