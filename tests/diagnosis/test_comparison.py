@@ -161,3 +161,5 @@ def test_changed_base_parameter_keeps_its_name_in_a_sentence():
         "steering_lag", {"time_constant": replace(estimate, unit="s")}, {"time_constant": 0.1}, 0.001, 0.2, 5.0
     )
     assert lag.sentence.endswith("changed: time_constant by 0.5 s (0.3 to 0.7 at 90 %), from 0.1 s.")
+    result = Comparison("changed", "Two changed.", (change, lag))
+    assert str(result).splitlines() == ["Two changed.", f"  {change.sentence}", f"  {lag.sentence}"]

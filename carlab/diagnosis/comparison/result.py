@@ -88,6 +88,10 @@ class Comparison:
     tested: tuple[Tested, ...] = ()
     is_complete: bool = True
 
+    def __repr__(self) -> str:
+        """The verdict, and one sentence for each change."""
+        return "\n  ".join([self.sentence, *(change.sentence for change in self.changes)])
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the schema, ready for JSON."""
         return {"schema": SCHEMA, **asdict(self)}
