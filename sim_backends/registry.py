@@ -102,8 +102,14 @@ def register(effect: Effect) -> None:
     """Add an effect to car files, all engines, the diagnosis, its reports, and the prior of learning.
 
     Raises:
-        ConfigError: its id exists, it has no parameters, it lacks a method, or it changes nothing.
+        ConfigError: it is a class, has an invalid or known id, has no parameters, lacks a method, or changes nothing.
     """
+    if isinstance(effect, type):
+        raise ConfigError(f"The effect {effect.__name__} is a class; give an object of it, {effect.__name__}().")
+    if not (name := getattr(effect, "id", "")).isidentifier():
+        raise ConfigError(
+            f"The id of the effect {type(effect).__name__} is {name!r}; set id in its class, of letters, digits and _."
+        )
     if effect.id in EFFECTS:
         raise ConfigError(f"There is an effect '{effect.id}' already; choose another id for the new effect.")
     if not effect.parameters:

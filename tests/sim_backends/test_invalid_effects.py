@@ -24,6 +24,21 @@ def test_effect_that_changes_nothing_is_refused(kind: type[Effect], method: str)
     assert "misspelt" not in EFFECTS
 
 
+@pytest.mark.parametrize("content", [{}, {"id": ""}, {"id": "cubic drag"}, {"id": "drag.cubic"}])
+def test_effect_without_a_valid_id_is_refused(content: dict[str, str]) -> None:
+    effect = type("Nameless", (DynamicsEffect,), {"parameters": PARAMETERS, **content})
+    with (
+        pytest.raises(ConfigError, match=r"id of the effect Nameless is .*; set id in its class"),
+        registered(effect()),
+    ):
+        pass
+    with (
+        pytest.raises(ConfigError, match=r"Nameless is a class; give an object of it, Nameless\(\)"),
+        registered(effect),
+    ):
+        pass
+
+
 @pytest.mark.parametrize(
     "drag",
     [
