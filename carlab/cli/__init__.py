@@ -60,6 +60,7 @@ def run(argv: Sequence[str]) -> int:
     import tyro
 
     from carlab.cli.console import console, fail, log_to_console
+    from carlab.cli.options import registry_without_none
     from carlab.core.errors import CarlabError
     from carlab.core.method_names import with_current_methods
     from carlab.core.version import VERSION
@@ -74,7 +75,12 @@ def run(argv: Sequence[str]) -> int:
 
         improve_help((*(each for each in verbs.values() if isinstance(each, type)), CarOptions, TaskOptions))
     verb = tyro.extras.subcommand_cli_from_dict(
-        verbs, args=with_current_methods([_with_home_folder(a) for a in argv]), prog="carlab", description=_DESCRIPTION
+        verbs,
+        args=with_current_methods([_with_home_folder(a) for a in argv]),
+        prog="carlab",
+        description=_DESCRIPTION,
+        config=(tyro.conf.DisallowNone,),
+        registry=registry_without_none(),
     )
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:

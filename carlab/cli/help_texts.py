@@ -5,8 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterable
 from dataclasses import is_dataclass, replace
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -42,39 +41,18 @@ def _join_lines(option_class: type) -> None:
 
 
 def _omit_empty_defaults(option_class: type) -> None:
-    """Print ``--track PATH`` instead of ``--track {None}|PATH ... (default: None)``."""
+    """Print ``--track PATH`` instead of ``--track PATH (default: None)``."""
     own = vars(option_class).get("__annotations__", {})
     hints = get_type_hints(option_class, include_extras=True)
     for name in own:
         value_type, *markers = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
         if not is_dataclass(value_type):
-            given = next((each for each in markers if isinstance(each, _SETTINGS)), tyro.conf.arg())
+            given: Any = next((each for each in markers if isinstance(each, _SETTINGS)), tyro.conf.arg())
             others = [each for each in markers if each is not given]
-            placeholder = None if _DISALLOW_NONE in others else _metavar(value_type)
-            own[name] = Annotated[value_type, *others, _without_empty_default(given, placeholder)]
+            own[name] = Annotated[value_type, *others, replace(given, help_behavior_hint=_default_text)]
 
 
 _SETTINGS = type(tyro.conf.arg())
-_DISALLOW_NONE = get_args(tyro.conf.DisallowNone[int])[1]
-"""Marker of a flag that may be absent."""
-
-
-def _without_empty_default(settings: Any, placeholder: str | None) -> Any:
-    """Settings of an option in tyro, with a placeholder for its value and a text for its default."""
-    return replace(settings, metavar=settings.metavar or placeholder, help_behavior_hint=_default_text)
-
-
-def _metavar(hint: Any) -> str | None:
-    """Placeholder for the value of an option that may be None; None for other options, which keep tyro's."""
-    if get_origin(hint) not in (Union, UnionType) or NoneType not in get_args(hint):
-        return None
-    return "|".join(_placeholder(each) for each in get_args(hint) if each is not NoneType)
-
-
-def _placeholder(hint: Any) -> str:
-    if get_origin(hint) is Literal:
-        return "{" + ",".join(map(str, get_args(hint))) + "}"
-    return str(hint.__name__).upper()
 
 
 def _default_text(default: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from rich.progress import Progress, TaskID
-from tyro.conf import DisallowNone, OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes, arg
 
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
 from carlab.api.runs import figure_names
@@ -112,7 +112,7 @@ class Learn:
     ray_wait: float = RAY_WAIT_S
     """Time without an answer of the cluster after which a training runs on this computer [s]."""
 
-    place: DisallowNone[bool | None] = None
+    place: bool | None = None
     """Start each episode at the task's start pose, at which a person places a real car (the default); off: at the car's
     current pose."""
 
@@ -126,7 +126,7 @@ class Learn:
     name: str | None = None
     """Last part of the name of this folder; learn by default."""
 
-    rerun: DisallowNone[bool | None] = None
+    rerun: bool | None = None
     """Also record .rrd files (the default)."""
 
     live: bool = False

@@ -6,12 +6,16 @@ import inspect
 import os
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import TYPE_CHECKING, Any, get_args
 
 from carlab.api.cars import car_options_text
 from carlab.core.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry
 
 
 @dataclass
@@ -63,6 +67,29 @@ def arguments_of(verb: Any, call: Callable[..., Any]) -> dict[str, Any]:
         if is_dataclass(values.get(group)):
             values |= vars(values.pop(group))
     return {name: values[name] for name in inspect.signature(call).parameters if name in values}
+
+
+def registry_without_none() -> ConstructorRegistry:
+    """Rules of tyro in which ``None`` is no value of an option: an option is ``None`` only if it is not given."""
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        types = get_args(info.type)
+        if len(types) != 2 or NoneType not in types:
+            return None
+        (value_type,) = (each for each in types if each is not NoneType)
+        values = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(value_type, info.markers))
+        assert isinstance(values, PrimitiveConstructorSpec)
+        return replace(
+            values,
+            is_instance=lambda value: value is None or values.is_instance(value),
+            str_from_instance=lambda value: [str(value)] if value is None else values.str_from_instance(value),
+        )
+
+    return registry
 
 
 def new_file(path: Path, option: str, suffix: str) -> None:

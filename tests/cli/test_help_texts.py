@@ -59,3 +59,26 @@ def test_option_without_default_has_the_type_of_its_value_only(verb: str, capsys
     assert printed.count("(default: ") >= 1
     with pytest.raises(SystemExit, match="2"):
         run([verb, "--no-such-option"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "choices"),
+    [
+        (("learn", "--resume", "missing", "--device", "None"), "Expected one of ('cpu', 'cuda')"),
+        (("import", "drive.csv", "--clock", "None"), "Expected one of ('column', 'velocity', 'even')"),
+        (("learn", "--resume", "missing", "--episodes", "None"), "invalid literal for int()"),
+    ],
+)
+def test_none_is_no_value_of_an_option(
+    arguments: tuple[str, ...], choices: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run(arguments)
+    printed = capsys.readouterr()
+    assert choices in " ".join((printed.out + printed.err).replace("│", " ").split())
+
+
+def test_options_that_an_import_proposes_need_no_value(capsys: pytest.CaptureFixture[str]) -> None:
+    """The findings of an import propose ``--swap-xy`` and ``--repair-yaw-rate``."""
+    assert run(["import", "missing.csv", "--swap-xy", "--repair-yaw-rate"]) == 2
+    assert "missing.csv' does not exist" in capsys.readouterr().err
