@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -84,3 +85,28 @@ def test_script_from_standard_input_gets_the_result_of_its_child() -> None:
     )
     ended = subprocess.run([sys.executable, "-"], input=script, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout) == (0, "2.0 <stdin>\n"), ended.stderr
+
+
+def test_stop_does_not_wait_for_the_imports_of_the_server(tmp_path: Path) -> None:
+    """The first server imports for a minute; after the stop the next child has another server."""
+    marker = tmp_path / "marker"
+    (tmp_path / "slow.py").write_text(
+        "import pathlib, time\n"
+        f"marker = pathlib.Path({str(marker)!r})\n"
+        "if not marker.exists():\n"
+        "    marker.touch()\n"
+        "    time.sleep(60.0)\n"
+    )
+    script = (
+        "import math, pathlib\n"
+        "from carlab.experiment.campaign import child_process\n"
+        "child_process._IMPORTED_ONCE = ('slow',)\n"
+        f"stop = pathlib.Path({str(marker)!r}).exists\n"
+        "print(child_process.run_in_child('root', math.sqrt, (4.0,), stop))\n"
+        "print(child_process.run_in_child('root', math.sqrt, (4.0,), lambda: False))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=50.0
+    )
+    assert (ended.returncode, ended.stdout) == (0, "None\n2.0\n"), ended.stderr

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkServerContext
+from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +79,32 @@ def _without_main_that_is_no_file() -> Iterator[None]:
         main["__file__"] = name
 
 
+def _start(child: ForkServerProcess, stop: Callable[[], bool]) -> bool:
+    """Start a child; False if ``stop`` was true before the server had done its imports.
+
+    A start waits for these imports. After a stop the server is killed; the next child has a new one.
+    """
+    errors: list[Exception] = []
+    stopped = False
+
+    def start() -> None:
+        try:
+            child.start()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=start, name=f"start of the {child.name}", daemon=True)
+    thread.start()
+    while thread.is_alive() and not (stopped := stop()):
+        thread.join(POLL_S)
+    if stopped:
+        os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)  # type: ignore[attr-defined]
+        thread.join()
+    elif errors:
+        raise errors[0]
+    return not errors
+
+
 def run_in_child(
     name: str,
     function: Callable[..., Any],
@@ -107,8 +135,11 @@ def run_in_child(
     call = (sender, name, function, arguments, on_report is not None, expected)
     child = context.Process(target=_call, args=call, daemon=True, name=name)
     with _without_main_that_is_no_file():
-        child.start()
+        is_started = _start(child, stop)
     sender.close()
+    if not is_started:
+        receiver.close()
+        return None
     try:
         while not stop():
             if receiver.poll(POLL_S):
