@@ -2,8 +2,11 @@
 
 Each output has its process: a plane with unknown slopes, and a smooth function with one lengthscale per input
 (automatic relevance determination). Hyperparameters and noise maximise the evidence times a log-normal prior (maximum a
-posteriori; Rasmussen and Williams 2006, equations 2.30 and 5.8), given the simulator's mean and the covariance of its
-parameters. Inputs and outputs are normalised.
+posteriori; Rasmussen and Williams 2006, equations 2.30 and 5.8). Inputs and outputs are normalised.
+
+The evidence integrates over the simulator's parameters. Their prior moments enter the covariance. Draws given the same
+rows enter as draws of the residual: the mean of their log densities is the expectation step of expectation maximisation
+(Dempster, Laird and Rubin 1977), whose fixed point maximises the evidence.
 """
 
 from __future__ import annotations
@@ -172,12 +175,14 @@ def fit_discrepancy(
     """Fit the covariance of the discrepancy and the noise by the evidence.
 
     With more than ``BATCH_ROWS`` rows the gradient is stochastic (Chen et al. 2020, "Stochastic gradient descent in
-    correlated settings: a study on Gaussian processes").
+    correlated settings: a study on Gaussian processes"). It is that of the subset's evidence and is not scaled to all
+    rows: the priors weigh as much as with ``BATCH_ROWS`` rows.
 
     Args:
         inputs: normalised (n, D).
-        residual: normalised outputs less the simulator's mean (n, O).
-        parameter_covariance: covariance of the simulator's output due to its parameters (O, n, n); None: zero.
+        residual: normalised outputs less the simulator's prior mean (n, O), or draws given the rows (P, n, O).
+        parameter_covariance: prior covariance of the simulator's output due to its parameters (O, n, n); None: zero,
+            as for draws given the rows.
         noise_std: prior median of the noise (O,).
         prior_std: prior size of the discrepancy (O,).
         row_weights: Student-t weights (n,); a row's noise variance is divided by its weight.
@@ -246,11 +251,11 @@ def _maximise_posterior(
     Args:
         medians: prior means of the logarithms, the initial values.
         log_stds: their prior standard deviations.
-        residual: (n, O), zero-mean Gaussian.
+        residual: zero-mean Gaussian (n, O), or draws of it (P, n, O).
         evaluate: covariance (O, m, m) of the rows with indices (m,) for given logarithms, and its pullback.
         seed: of the subsets of rows.
     """
-    generator, count = torch.Generator().manual_seed(seed), len(residual)
+    generator, count = torch.Generator().manual_seed(seed), residual.shape[-2]
     rows = torch.arange(count, device=residual.device)
     logs = [m.clone() for m in medians]
     optimisers = [Adam(value) for value in logs]
@@ -258,7 +263,7 @@ def _maximise_posterior(
         if count > BATCH_ROWS and step % STEPS_PER_BATCH == 0:
             rows = torch.randperm(count, generator=generator)[:BATCH_ROWS].to(residual.device)
         covariance, pullback = evaluate(logs, rows)
-        gradients = pullback(evidence_gradient(residual[rows], covariance))
+        gradients = pullback(evidence_gradient(residual[..., rows, :], covariance))
         cosine = 0.5 * (1.0 + math.cos(math.pi * step / STEPS))
         rate = LEARNING_RATE * (FINAL_RATE_SHARE + (1.0 - FINAL_RATE_SHARE) * cosine)
         prior_gradients = [(v - m) / width**2 for v, m, width in zip(logs, medians, log_stds, strict=True)]
@@ -294,14 +299,15 @@ def _covariance_of(logs: list[Tensor]) -> DiscrepancyCovariance:
 def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
     """Gradient (O, n, n) of the negative log evidence with respect to the covariance.
 
-    ``(K^-1 - K^-1 r r^T K^-1) / 2`` (Rasmussen and Williams 2006, equation 5.9).
+    ``(K^-1 - K^-1 r r^T K^-1) / 2`` (Rasmussen and Williams 2006, equation 5.9), averaged over draws of r.
 
     Args:
-        residual: (n, O).
+        residual: (n, O), or equally weighted draws (P, n, O).
         covariance: of zero-mean Gaussians (O, n, n).
     """
     factor = torch.linalg.cholesky(covariance)
-    solved = torch.cholesky_solve(residual.T[:, :, None], factor)
+    draws = residual.view(-1, *residual.shape[-2:]).permute(2, 1, 0)  # (O, n, P)
+    solved = torch.cholesky_solve(draws, factor)
     gradient: Tensor = torch.cholesky_inverse(factor)
     # The gradient is symmetric; its transpose has the memory layout of the other matrices.
-    return gradient.baddbmm_(solved, solved.transpose(1, 2), beta=0.5, alpha=-0.5).mT
+    return gradient.baddbmm_(solved, solved.transpose(1, 2), beta=0.5, alpha=-0.5 / draws.shape[2]).mT

@@ -99,10 +99,8 @@ def infer(
         generator = torch.Generator().manual_seed(seed)
         chosen = torch.randperm(len(inputs), generator=generator)[:MAX_ROWS].to(inputs.device)
         inputs, outputs = inputs[chosen], outputs[chosen]
-    if discrepancy_std is None:
-        prior_std = PRIOR_DISCREPANCY_STD * torch.ones_like(noise_std)
-    else:
-        prior_std = discrepancy_std / normaliser.output_std
+    default_std = PRIOR_DISCREPANCY_STD * torch.ones_like(noise_std)
+    prior_std = default_std if discrepancy_std is None else discrepancy_std / normaliser.output_std
     problem = _Problem(
         model, inputs, outputs, normaliser, (noise_std / normaliser.output_std).double(), prior_std.double(),
         with_discrepancy, noise_known, seed,
@@ -160,11 +158,13 @@ class _Residual:
         mean: normalised outputs less the mean of the draws (n, O).
         parameter_covariance: covariance of the draws (O, n, n); None without a simulator.
         inputs: of the discrepancy (n, D + O), or (n, D) without a simulator.
+        posterior: normalised outputs less each draw (P, n, O), if the draws are given the rows.
     """
 
     mean: Tensor
     parameter_covariance: Tensor | None
     inputs: Tensor
+    posterior: Tensor | None = None
 
 
 @dataclass(slots=True)
@@ -266,7 +266,7 @@ def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, genera
         discrepancy = DiscrepancyCovariance.at_prior_median(
             problem.inputs.shape[1], problem.discrepancy_std, problem.multiplier_share
         )
-    residual = _residual(problem, parameters, problem.normaliser)
+    residual = _residual(problem, parameters, problem.normaliser, given_rows=known_parameters is not None)
     estimate = _Estimate(
         problem.normaliser, parameters, residual, discrepancy, noise, noise, ones,
         torch.eye(len(noise), dtype=torch.float64, device=problem.inputs.device), problem.max_dof,
@@ -294,17 +294,15 @@ def _prior_parameters(problem: _Problem, model: DomainModel, generator: torch.Ge
 def _fit_covariance(problem: _Problem, estimate: _Estimate) -> None:
     """Fit discrepancy and noise to the residual by the evidence."""
     residual, noise_prior = estimate.residual, estimate.noise_prior_std
-    width = problem.inputs.shape[1]
+    width, given = problem.inputs.shape[1], residual.posterior
+    rows = (residual.mean, residual.parameter_covariance) if given is None else (given, None)
     if problem.with_discrepancy:
         estimate.discrepancy, estimate.noise_std = fit_discrepancy(
-            residual.inputs[:, :width], residual.mean, residual.parameter_covariance, noise_prior,
-            problem.discrepancy_std, estimate.row_weights,
+            residual.inputs[:, :width], *rows, noise_prior, problem.discrepancy_std, estimate.row_weights,
             None if problem.model is None else residual.inputs[:, width:], problem.seed, problem.multiplier_share,
         )  # fmt: skip
     elif not problem.noise_known:
-        estimate.noise_std = fit_noise(
-            residual.mean, residual.parameter_covariance, noise_prior, estimate.row_weights, problem.seed
-        )
+        estimate.noise_std = fit_noise(*rows, noise_prior, estimate.row_weights, problem.seed)
 
 
 def _infer_parameters(problem: _Problem, estimate: _Estimate, rows: Tensor, generator: torch.Generator) -> None:
@@ -365,14 +363,18 @@ def _condition(problem: _Problem, estimate: _Estimate) -> FunctionPosterior:
     )  # fmt: skip
 
 
-def _residual(problem: _Problem, parameters: Tensor | None, normaliser: Normaliser) -> _Residual:
+def _residual(
+    problem: _Problem, parameters: Tensor | None, normaliser: Normaliser, *, given_rows: bool = True
+) -> _Residual:
     inputs = normaliser.inputs(problem.inputs).double()
     targets = normaliser.outputs(problem.outputs).double()
     if problem.model is None or parameters is None:
         return _Residual(targets, None, inputs)
     simulated = simulate(problem.model, problem.inputs, parameters, normaliser)
-    mean, covariance = moments(simulated[_plausible(simulated)])
-    return _Residual(targets - mean, covariance, torch.cat([inputs, mean], dim=1))
+    simulated = simulated[_plausible(simulated)]
+    mean, covariance = moments(simulated)
+    given = targets - simulated if given_rows else None
+    return _Residual(targets - mean, covariance, torch.cat([inputs, mean], dim=1), given)
 
 
 def _plausible(simulated: Tensor) -> Tensor:

@@ -123,16 +123,18 @@ def test_pullback_equals_finite_differences(with_simulator):
             assert float(gradient[index]) == pytest.approx((values[0] - values[1]) / 2e-5, abs=1e-6)
 
 
-def test_evidence_gradient_equals_finite_differences_of_scipy():
-    """Central differences along symmetric directions."""
-    residual, roots, direction = normal(6, 2), normal(2, 6, 6, seed=1), normal(2, 6, 6, seed=2)
+@pytest.mark.parametrize("draws", [(), (1,), (3,)])
+def test_evidence_gradient_equals_finite_differences_of_scipy(draws):
+    """Central differences along symmetric directions, of the mean over draws of the residual."""
+    residual, roots, direction = normal(*draws, 6, 2), normal(2, 6, 6, seed=1), normal(2, 6, 6, seed=2)
     covariance = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(6)
     direction = direction + direction.transpose(1, 2)
     found = evidence_gradient(residual, covariance)
     for k in range(2):
 
         def nll(step, k=k):
-            return -multivariate_normal(np.zeros(6), covariance[k] + step * direction[k]).logpdf(residual[:, k])
+            distribution = multivariate_normal(np.zeros(6), covariance[k] + step * direction[k])
+            return -np.mean(distribution.logpdf(residual[..., k]))
 
         expected = (nll(1e-5) - nll(-1e-5)) / 2e-5
         assert float((found[k] * direction[k]).sum()) == pytest.approx(expected, rel=1e-6)
