@@ -43,12 +43,14 @@ class Task(ABC):
         history_length: H, the number of past actions in the features; a run sets it.
         max_ticks: number of ticks of an episode.
         cost_weight: reward that one unit of constraint cost takes away in the training of a policy.
+        tick_weight: factor on the rewards and costs of a tick; ``at_period`` sets it.
     """
 
     name: str = "task"
     history_length: int = 3
     max_ticks: int = 100
     cost_weight: float = 1.0
+    tick_weight: float = 1.0
 
     @property
     def arena_m(self) -> Corners:
@@ -139,7 +141,7 @@ class Task(ABC):
 
     def _at_tick_weight(self, period_s: float) -> Self:
         """Copy whose ``tick_weight`` is the duration of a tick in reference ticks, with the same duration."""
-        weight = round(period_s * REFERENCE_RATE_HZ, TICK_WEIGHT_DIGITS)
+        weight = reference_ticks(period_s)
         if weight == 1.0:
             return self
         return self._with_attributes({"tick_weight": weight, "max_ticks": max(round(self.max_ticks / weight), 1)})
@@ -156,6 +158,11 @@ class Task(ABC):
                     "the class."
                 ) from error
         return changed
+
+
+def reference_ticks(period_s: float) -> float:
+    """Duration of a control period [s] in ticks of ``REFERENCE_RATE_HZ``."""
+    return round(period_s * REFERENCE_RATE_HZ, TICK_WEIGHT_DIGITS)
 
 
 def long_tail_tolerance(distance: Any, bound: float, margin: float, value_at_margin: float = 0.1) -> Any:

@@ -44,7 +44,7 @@ class SacSettings:
         batch: transitions of a gradient step.
         replay: size of the replay buffer [transitions].
         warm_up: transitions before the first update; with random actions if there is no earlier policy.
-        discount: discount factor.
+        discount: discount factor of a tick at 30 Hz; a caller sets it for other rates.
         learning_rate: step size of the optimiser.
         target_rate: rate of the target networks' moving average.
         temperature: initial entropy coefficient.

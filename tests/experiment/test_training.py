@@ -30,7 +30,7 @@ from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent
 from learning.priors.simulator_model import CarModel
-from learning.transitions import transitions_of
+from learning.transitions import Transitions, transitions_of
 from learning.world import car_fit, model_env
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import CarFitSettings
@@ -176,6 +176,31 @@ def test_training_has_a_larger_stopping_margin_and_a_parking_bonus_and_the_predi
     assert training_env._bonus(features).tolist() == pytest.approx([SUCCESS_BONUS, 0.0])
     assert evaluation_env._bonus is None
     assert prediction_env._bonus is None, "the predicted return is the task's reward alone"
+
+
+@pytest.mark.parametrize("rate_hz", [30.0, 60.0, 15.0])
+def test_horizon_and_bonus_of_a_second_are_the_same_at_each_rate(
+    monkeypatch: pytest.MonkeyPatch, rate_hz: float
+) -> None:
+    choice = choose_car("sim")
+    simulator = replace(choice.simulator, control_period_s=round(1.0 / rate_hz, 10))
+    plan = tiny_plan(replace(choice, simulator=simulator))
+    discounts: list[float] = []
+
+    def train_policy(self: SacAgent, *arguments: Any) -> None:
+        discounts.append(self._settings.discount)
+        raise DataError("policy is not needed")
+
+    monkeypatch.setattr(SacAgent, "train", train_policy)
+    rows = Transitions(np.zeros((1, 5 + 2 * HISTORY)), np.zeros((1, 6)), np.zeros(1), np.zeros(1), HISTORY)
+    env, _ = training._environments(plan, linear_car(None, rows, 1, 0), [], ENVELOPE, 0)
+    with pytest.raises(DataError, match="policy is not needed"):
+        training._trained_policy(plan, env, env, None, 1, lambda *what: None)
+    assert discounts == [pytest.approx(0.99 ** (30.0 / rate_hz))]
+    assert rate_hz != 30.0 or discounts == [0.99]
+    parked = torch.from_numpy(encode(np.zeros((1, 6)), np.zeros((1, HISTORY, 2)))).float()
+    assert env._bonus is not None
+    assert rate_hz * float(env._bonus(parked)) == pytest.approx(30.0 * SUCCESS_BONUS)
 
 
 def test_training_accepts_an_episode_without_a_tick(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.safety_bounds import SAFETY_BOUNDS
 from carlab.core.state_estimator import StateEstimator
+from carlab.core.task import reference_ticks
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.figures_file import FIGURES_FILE, read_training_figures
 from carlab.experiment.campaign.predicted_return import predicted_figures
@@ -50,8 +51,8 @@ DYNAMICS_FILE = "dynamics.pt"
 PRIOR_FILE = "prior.toml"
 N_EVALUATION_CARS = 64
 SUCCESS_BONUS, SUCCESS_SCORE = 0.3, 10.0
-"""Reward for each tick with success in the learned car, additional to the task's reward; and score of a policy that
-always succeeds, additional to its return. The paper's parking reward decreases by only 2 % at 0.2 m from the goal."""
+"""Reward for a tick of 1/30 s with success in the learned car, additional to the task's reward; and score of a policy
+that always succeeds, additional to its return. The paper's reward decreases by only 2 % at 0.2 m from the goal."""
 EXTRA_REACTION_S = 0.12
 """Additional reaction time of the learned car's safety gate: a margin of 0.24 m at 2 m/s to the gate of the car."""
 EPISODES_BEFORE_HISTORY_CHOICE = 3
@@ -189,7 +190,7 @@ def _environments(
     recorded = recorded_features(episodes, plan.history) if episodes else None
 
     def bonus(features: Tensor) -> Tensor:
-        value: Tensor = SUCCESS_BONUS * task.success(features).to(features)
+        value: Tensor = SUCCESS_BONUS * task.tick_weight * task.success(features).to(features)
         return value - task.cost_weight * task.cost(features) if task.has_constraint else value
 
     training = model_env.ModelEnv(dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, seed=seed, **gate)
@@ -230,6 +231,7 @@ def _trained_policy(
     from learning.policy.sac_agent import SacAgent, SacSettings
 
     task, sac = plan.task, SacSettings()
+    sac = replace(sac, discount=sac.discount ** reference_ticks(plan.control_period_s))
     figures: dict[str, Any] = {}
 
     def evaluate(candidate: SacAgent) -> float:
