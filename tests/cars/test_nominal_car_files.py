@@ -15,6 +15,7 @@ from carlab.core.quantities import Action, CarState, Reality
 from sim_backends.car_parameters import SimulatorConfig
 
 CARS = ("eth_rc_car", "dart_jetracer", "dart_jetracer_linear")
+ALL_CARS = (*CARS, "eth_rc_car_effects")
 MEASURED_PARAMETERS = (
     "vehicle.mass",
     "vehicle.front_axle",
@@ -24,7 +25,7 @@ MEASURED_PARAMETERS = (
 )
 
 
-@pytest.mark.parametrize("name", CARS)
+@pytest.mark.parametrize("name", ALL_CARS)
 def test_preset_is_loaded_by_name_and_by_path(name):
     by_name = load_car_file(Path(name))
     with resources.as_file(resources.files("sim_backends") / "presets" / f"{name}.toml") as path:
@@ -61,7 +62,17 @@ def test_linear_preset_differs_only_in_its_tyre_model():
     assert dynamic.priors == linear.priors
 
 
-@pytest.mark.parametrize("name", CARS)
+def test_preset_with_effects_is_the_eth_car_with_a_range_for_each_effect():
+    plain, uncertain = (SimulatorConfig.from_preset(n) for n in ("eth_rc_car", "eth_rc_car_effects"))
+    assert uncertain.parameters == plain.parameters
+    assert uncertain.mocap == plain.mocap
+    assert {n for n, r in plain.priors.items() if uncertain.priors[n] != r} == {"motor.drive_gain", "motor.damping"}
+    of_effects = set(uncertain.priors) - set(plain.priors)
+    assert {name.split(".")[1] for name in of_effects} == set(uncertain.effects)
+    assert len(uncertain.effects) == 8
+
+
+@pytest.mark.parametrize("name", ALL_CARS)
 def test_preset_can_be_driven_as_a_simulated_car(name):
     choice = choose_car(name)
     assert choice.car.reality is Reality.SIMULATED
@@ -77,9 +88,14 @@ def test_preset_can_be_driven_as_a_simulated_car(name):
 
 
 def test_unknown_name_is_refused_with_the_available_names(capfd):
-    with pytest.raises(ConfigError, match="dart_jetracer, dart_jetracer_linear, eth_rc_car, rc_car"):
+    with pytest.raises(
+        ConfigError, match="dart_jetracer, dart_jetracer_linear, eth_rc_car, eth_rc_car_effects, rc_car"
+    ):
         load_car_file(Path("dart_jetracr"))
-    with pytest.raises(ConfigError, match=r"dart_jetracer, dart_jetracer_linear, eth_rc_car, rc_car, or a FILE\.toml"):
+    with pytest.raises(
+        ConfigError,
+        match=r"dart_jetracer, dart_jetracer_linear, eth_rc_car, eth_rc_car_effects, rc_car, or a FILE\.toml",
+    ):
         choose_car("dart_jetracr")
     assert run(["replay", "nothing.csv", "--car", "dart_jetracr"]) == 2
     assert "eth_rc_car" in " ".join(capfd.readouterr().err.split())
