@@ -18,6 +18,10 @@ IndexArray = NDArray[np.intp]
 HALF_WINDOW_S = 0.05
 """Half the span of the fit [s]: eleven samples at 100 Hz, the minimum of five at 30 Hz."""
 MIN_HALF_ROWS = 2
+_BLOCK_SAMPLES = 500_000
+"""Samples of windows that are in memory at once."""
+_MIN_PARABOLA_SQUARE = 1e-28
+"""A smaller value is rounding: but for it, the times are only two, which determine a line."""
 
 # A break is a step beyond the motion of the neighbouring rows plus accelerations of 100 m/s^2 (twice those of a hard
 # collision) and 500 rad/s^2, plus 5 cm and 0.3 rad for jitter of the stamps.
@@ -91,14 +95,33 @@ def _local_slopes(t_s: FloatArray, values: FloatArray, half: int) -> FloatArray:
     if width < 3:
         return np.repeat(np.diff(values, axis=1) / np.diff(t_s), 2, axis=1)
     start = np.clip(np.arange(n) - half, 0, n - width)
-    times = sliding_window_view(t_s, width)[start] - t_s[:, None]
-    windows = sliding_window_view(values, width, axis=1)[:, start]
+    all_times, all_values = sliding_window_view(t_s, width), sliding_window_view(values, width, axis=1)
+    slopes = np.empty_like(values)
+    block_rows = max(1, _BLOCK_SAMPLES // width)
+    for first in range(0, n, block_rows):
+        rows = slice(first, first + block_rows)
+        times = all_times[start[rows]] - t_s[rows, None]
+        offsets = all_values[:, start[rows]] - values[:, rows, None]
+        slopes[:, rows] = np.einsum("nw,cnw->cn", _slope_weights(times), offsets)
+    return slopes
+
+
+def _slope_weights(times: FloatArray) -> FloatArray:
+    """Weights (n, w) of the values at ``times`` (n, w) in the slope at 0 of the quadratic that fits them best.
+
+    The quadratic is a sum of a constant, a line and a parabola that are orthogonal on the times of a row.
+    """
     scale = np.abs(times).max(axis=1, keepdims=True)
     u = times / scale
-    design = np.stack([np.ones_like(u), u, u * u], axis=-1)
-    weights = np.linalg.pinv(design)[:, 1]
-    slopes: FloatArray = np.einsum("nw,cnw->cn", weights, windows - values[:, :, None]) / scale[:, 0]
-    return slopes
+    line = u - u.mean(axis=1, keepdims=True)
+    line_square = np.sum(line * line, axis=1, keepdims=True)
+    tilt = np.sum(u * u * line, axis=1, keepdims=True) / line_square
+    parabola = u * u - np.mean(u * u, axis=1, keepdims=True) - tilt * line
+    parabola_square = np.sum(parabola * parabola, axis=1, keepdims=True)
+    has_parabola = parabola_square > _MIN_PARABOLA_SQUARE
+    bend = np.divide(tilt * parabola, parabola_square, out=np.zeros_like(u), where=has_parabola)
+    weights: FloatArray = (line / line_square - bend) / scale
+    return weights
 
 
 def _median_of_neighbours(rates: FloatArray) -> FloatArray:

@@ -1,6 +1,7 @@
 """Velocities of imported recordings: which columns are used, and by which clock the pose is differentiated."""
 
 import importlib.util
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from carlab.core.errors import ConfigError
 from carlab.recording.audit.report import Severity
 from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.faults import robust
+from carlab.recording.pose_velocity import pose_motion
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
 foreign = importlib.util.module_from_spec(_spec)
@@ -101,3 +104,52 @@ def test_reference_that_is_not_compared_is_reported(tmp_path):
     assert not findings("encoder")
     with pytest.raises(ConfigError, match="Unknown key 'steering' in the references of mapping"):
         CANONICAL.with_options(references={"encoder": "steering"})
+
+
+@pytest.mark.parametrize("rows", [2, 3, 4, 400])
+def test_velocities_are_slopes_of_local_quadratics(rows):
+    rng = np.random.default_rng(3)
+    t_s = np.cumsum(rng.uniform(0.002, 0.03, rows))
+    x_m, y_m = rng.normal(size=(2, rows))
+    motion = pose_motion(t_s, x_m, y_m, np.zeros(rows), np.zeros(rows))
+    width = min(2 * motion.half_rows + 1, rows)
+    for row in range(rows):
+        first = min(max(row - motion.half_rows, 0), rows - width)
+        window = slice(first, first + width)
+        slope = np.polyfit(t_s[window] - t_s[row], x_m[window], min(2, width - 1))[-2]
+        assert motion.vx[row] == pytest.approx(slope, rel=1e-8, abs=1e-8)
+
+
+def test_stamps_that_coincide_but_for_rounding_have_finite_velocities():
+    t_s = np.array([0.0, 1e-17, 0.02])
+    motion = pose_motion(t_s, np.array([0.0, 0.0, 0.02]), np.zeros(3), np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(motion.vx, 1.0)
+
+
+def test_velocities_of_a_fast_log_need_little_memory():
+    """Of 60 000 rows at 1 kHz, all windows of 101 poses together would take 200 MB."""
+    t_s = np.arange(60_000) / 1000.0
+    tracemalloc.start()
+    motion = pose_motion(t_s, np.sin(t_s), np.cos(t_s), np.unwrap(t_s), np.zeros(len(t_s)))
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(motion.yaw_rate, 1.0, rtol=1e-9)
+    assert peak_bytes < 60e6
+
+
+def test_fit_of_a_long_column_by_every_kth_row_is_the_same(monkeypatch):
+    t_s = np.arange(20_000) / 1000.0
+    reference = foreign.yaw_rate(t_s)
+    column = 1.1 * np.interp(t_s - 0.05, t_s, reference) + np.random.default_rng(0).normal(0.0, 0.02, len(t_s))
+
+    def fit():
+        return robust.fit_column(t_s, reference, column, t_s > 1.0, lags_s=robust.LAGS_S, time_constants_s=(0.0,))
+
+    by_all_rows = fit()
+    monkeypatch.setattr(robust, "MAX_FIT_ROWS", 4000)
+    by_every_fifth_row = fit()
+    assert by_every_fifth_row.scale == pytest.approx(by_all_rows.scale, rel=1e-3)
+    assert by_every_fifth_row.lag_s == pytest.approx(by_all_rows.lag_s, abs=3e-3)
+    assert by_every_fifth_row.unexplained == pytest.approx(by_all_rows.unexplained, rel=0.1)
+    assert by_every_fifth_row.prediction.shape == t_s.shape
+    assert by_every_fifth_row.scale != by_all_rows.scale

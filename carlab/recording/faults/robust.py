@@ -18,6 +18,8 @@ TIME_CONSTANTS_S = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 FILTER_LAG_PERIODS = np.arange(-1.0, 2.01, 0.5)
 KEPT_SHARE = 0.95
 """Share of the rows that a trimmed fit keeps."""
+MAX_FIT_ROWS = 50_000
+"""A fit takes every k-th row of a longer column: eight minutes at 100 Hz determine scale and lag."""
 
 
 def robust_std(values: FloatArray) -> float:
@@ -124,19 +126,21 @@ def fit_column(
         t_s: stamps (N,).
         reference: what the column should measure (N,).
         column: the column (N,).
-        rows: mask (N,) of the rows to compare; larger values than six times the 90th percentile do not count.
+        rows: mask (N,) of the rows to compare; larger values than six times the 90th percentile do not count, and of
+            more than ``MAX_FIT_ROWS`` only every k-th.
         lags_s: even grid of dead times, refined by a parabola; without it, -1 to 2 rows in half rows, not refined,
             because velocity columns are differences of poses and lag by whole or half rows.
         time_constants_s: of the first-order filter; ``(0.0,)`` fits a dead time alone.
     """
     period = float(np.median(np.diff(t_s)))
     lags = FILTER_LAG_PERIODS * period if lags_s is None else lags_s
-    compared = rows & (np.abs(column) < 6.0 * np.percentile(np.abs(column[rows]), 90) + 1e-9)
+    compared = np.flatnonzero(rows & (np.abs(column) < 6.0 * np.percentile(np.abs(column[rows]), 90) + 1e-9))
+    compared = compared[:: max(1, math.ceil(len(compared) / MAX_FIT_ROWS))]
     target = column[compared]
     mean_square = float(np.mean(target**2)) + 1e-18
 
     def fit(filtered: FloatArray, lag_s: float) -> tuple[float, float]:
-        scale, cost = _trimmed_scale(np.interp(t_s - lag_s, t_s, filtered)[compared], target)
+        scale, cost = _trimmed_scale(np.interp(t_s[compared] - lag_s, t_s, filtered), target)
         return cost / mean_square, scale
 
     best = (math.inf, 0.0, 0.0, reference)
