@@ -26,6 +26,8 @@ TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25)
 MIN_MPS, MIN_ROWS = 0.4, 250
 GRID_S, SLOPE_WINDOW_S = 0.02, 0.2
 UNKNOWN_BEFORE_S, UNKNOWN_AFTER_S = 0.2, 0.6
+MAX_GAP_S = 5.0
+"""Longest gap whose rows of the grid are a step apart. Two drives of one file may be days apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> Gri
     """
     period = float(np.median(np.diff(t_s)))
     step = max(period, GRID_S)
-    grid = np.arange(t_s[0], t_s[-1], step)
+    grid = _even_times(t_s, step)
     vx, vy, rate = (np.interp(grid, t_s, c) for c in (motion.vx, motion.vy, motion.yaw_rate))
     width = max(2 * round(0.5 * SLOPE_WINDOW_S / step) + 1, 5)
     spans = ((2 * motion.half_rows + 1) * period, width * step)
@@ -100,6 +102,15 @@ def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> Gri
     for row in np.flatnonzero(np.diff(segment) != 0):  # the command across a gap is not known
         rows &= (grid < t_s[row] - UNKNOWN_BEFORE_S) | (grid > t_s[row + 1] + UNKNOWN_AFTER_S)
     return GridMotion(grid, step, vx, rate, slope - vy * rate, rows, spans)
+
+
+def _even_times(t_s: FloatArray, step_s: float) -> FloatArray:
+    """Times (n,) from the first to the last of ``t_s`` (N,), a step apart; further apart in gaps beyond MAX_GAP_S."""
+    gaps_s = np.diff(t_s)
+    if gaps_s.max() <= MAX_GAP_S:
+        return np.arange(t_s[0], t_s[-1], step_s)
+    shortened = np.concatenate([[0.0], np.cumsum(np.minimum(gaps_s, MAX_GAP_S))])
+    return np.interp(np.arange(0.0, shortened[-1], step_s), shortened, t_s)
 
 
 @dataclass(frozen=True, slots=True)
