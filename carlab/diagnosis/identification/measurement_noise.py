@@ -97,7 +97,8 @@ def _deviation(
         return 0.0
     limit = settings.noise_max_z * spread
     clipped = np.clip(residual, -limit, limit)
-    rows = min(settings.noise_segment_rows, len(clipped))
+    segment_rows = max(settings.noise_segment_rows, round(settings.noise_segment_s / period_s))
+    rows = min(segment_rows, len(clipped))
     frequency, power = welch(clipped, 1.0 / period_s, nperseg=rows, detrend=False)
     high_pass = -savgol_coeffs(width, 3)
     high_pass[width // 2] += 1.0

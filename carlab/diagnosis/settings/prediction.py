@@ -66,7 +66,9 @@ class IdentificationSettings:
     noise_max_z: float = 3.0
     """Residuals are clipped here [robust standard deviations]; larger ones are motion faster than the cubic."""
     noise_segment_rows: int = 64
-    """Rows of a segment of Welch's spectrum (Welch 1967)."""
+    """Minimum rows of a segment of Welch's spectrum (Welch 1967)."""
+    noise_segment_s: float = 1.0
+    """Minimum length [s] of a segment: its resolution of 1 Hz is finer than the edge of the cubic's filter (5 Hz)."""
     slowest_share: float = 0.3
     """Share of the slowest rows, which give the noise of a car whose wheels vibrate."""
     max_error_quantile: float = 0.99
