@@ -76,6 +76,7 @@ def _around_the_start(windows: PredictionWindows, half: int) -> PredictionWindow
         past_states=windows.past_states[:, :-half],
         t0_s=windows.t0_s - half * windows.period_s,
         velocity_window_s2=0.0,
+        command_deviations=windows.deviations_in(slice(windows.past_commands.shape[1] + half)),
     )
 
 

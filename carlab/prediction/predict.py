@@ -132,25 +132,27 @@ def simulate_windows(
     effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
     delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
     inner[COMMAND_DELAY] = np.asarray(delay_s)
-    unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, parameter_std={})
-    count = len(windows)
+    parts, commands = windows.part_commands()
+    part_s = windows.period_s / parts
+    unmeasured = replace(whole, effects=effects, control_period_s=part_s, priors={}, parameter_std={})
+    count, first = len(windows), commands.shape[1] - windows.steps * parts
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
     start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
     origin = _origins(start, effects)
     is_far = bool((np.abs(start - origin)[..., :3] > MAX_SINGLE_POSE).any())
     tensor = partial(_tensor, dtype=np.float64 if in_double or is_far else np.float32)
-    earlier = _past_of_hidden_states(windows, measurement, effects, origin)
+    earlier = _past_of_hidden_states(windows, measurement, effects, start - origin, origin, parts)
     states = rollout(
         unmeasured,
         tensor((start - origin).reshape(-1, 6)),
-        tensor(np.tile(windows.commands, (sets, 1, 1))),
-        history=tensor(np.tile(windows.past_commands, (sets, 1, 1))),
+        tensor(np.tile(commands[:, first:], (sets, 1, 1))),
+        history=tensor(np.tile(commands[:, :first], (sets, 1, 1))),
         history_states=None if earlier is None else tensor(earlier),
         values={name: tensor(np.broadcast_to(v, (sets, count)).reshape(-1)) for name, v in inner.items()},
         t0_s=tensor(np.tile(windows.t0_s, sets)),
         max_step_s=longest_step_s(windows, config, values) if max_step_s is None else max_step_s,
         engine=engine,
-    ).states
+    ).states[:, ::parts]
     rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
     rows = rows.reshape(windows.steps + 1, 6, sets, count) + np.moveaxis(origin, -1, 0)
     trajectory: list[State] = [tuple(tick) for tick in rows]
@@ -170,15 +172,25 @@ def _tensor(array: FloatArray, dtype: type[np.floating[Any]]) -> torch.Tensor:
 
 
 def _past_of_hidden_states(
-    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str], origin: FloatArray
+    windows: PredictionWindows,
+    measurement: MeasurementModel,
+    effects: Iterable[str],
+    start: FloatArray,
+    origin: FloatArray,
+    parts: int,
 ) -> FloatArray | None:
-    """True states (P S, H, 6) before windows, less ``origin`` (P, S, 6); None if no hidden state depends on them."""
+    """True states (P S, H R, 6) before windows, at R parts of each step; None if no hidden state depends on them.
+
+    States, and those at the ``start`` (P, S, 6), are less ``origin`` (P, S, 6).
+    """
     used = [EFFECTS[name] for name in effects]
     if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in used):
         return None
     past = [measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)]
     states = _stacked(past, len(origin)) - origin[:, :, None]
-    return states.reshape(-1, len(past), 6)
+    change = np.diff(states, axis=2, append=start[:, :, None])
+    share = (np.arange(parts) / parts)[:, None]
+    return np.asarray(states[:, :, :, None] + share * change[:, :, :, None]).reshape(-1, len(past) * parts, 6)
 
 
 def _origins(start: FloatArray, effects: Iterable[str]) -> FloatArray:

@@ -20,6 +20,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
+from carlab.prediction.even_grid import MIN_DEVIATION, cell_means, even_grid, part_count, part_deviations, row_period_s
 
 IndexArray = NDArray[np.int64]
 
@@ -36,10 +37,6 @@ MAX_PERIOD_S = 0.034
 """Maximum period of a thinned recording [s]."""
 MIN_SPEED_MPS = 0.15
 """Windows in which the car is slower [m/s] are omitted, because any model predicts a parked car."""
-MAX_JITTER_SHARE, MAX_JITTER_S = 0.2, 1e-3
-"""Maximum deviation of the time between rows from its mean, share or [s]: jitter, or stamps in whole milliseconds."""
-MAX_PERIOD_DEVIATION = 1e-3
-"""Maximum relative deviation of a segment's period from that of its grid."""
 MAX_OFFSET_SHARE = 0.02
 """Maximum distance of rows to the grid, share of the period, up to which they are not interpolated."""
 EVENT_COLUMN = "event"
@@ -64,6 +61,8 @@ class RecordingSegment:
         curvature_bias: (n, 6) states of a local quintic minus ``smooth``.
         sampled_s: period before thinning.
         in_event: (n,) whether a row, or a pose that its initial state is estimated from, is in an event.
+        command_deviations: (n, R, 2) commands in R equal parts of each cell less their mean over the cell; None if they
+            are constant in each cell.
     """
 
     recording: int
@@ -77,6 +76,7 @@ class RecordingSegment:
     curvature_bias: FloatArray
     sampled_s: float
     in_event: NDArray[np.bool_]
+    command_deviations: FloatArray | None = None
 
     @property
     def duration_s(self) -> float:
@@ -93,6 +93,7 @@ class RecordingSegment:
             curvature_bias=self.curvature_bias[rows],
             commands=self.commands[rows],
             in_event=self.in_event[rows],
+            command_deviations=None if self.command_deviations is None else self.command_deviations[rows],
         )
 
 
@@ -115,6 +116,8 @@ class PredictionWindows:
         velocity_window_s2: variance [s2] of the window over which the recording's velocities were differentiated; 0
             if they are instantaneous.
         velocities_from_poses: whether the initial velocities are differentiated poses, not recorded velocities.
+        command_deviations: (S, H + K, R, 2) commands in R equal parts of each step, before the window and in it, less
+            their mean over the step; None if they are constant in each step.
         in_event: (S,) whether the window has rows of an event; only windows that are cut with events have such rows.
     """
 
@@ -131,6 +134,7 @@ class PredictionWindows:
     in_event: NDArray[np.bool_]
     velocity_window_s2: float = 0.0
     velocities_from_poses: bool = True
+    command_deviations: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.initial_states)
@@ -144,6 +148,19 @@ class PredictionWindows:
     def horizon_s(self) -> float:
         """Length of each window."""
         return self.steps * self.period_s
+
+    def part_commands(self) -> tuple[int, FloatArray]:
+        """Number of parts R of a step, and the commands (S, (H + K) R, 2) of the parts before the window and in it."""
+        commands = np.concatenate([self.past_commands, self.commands], axis=1)
+        if self.command_deviations is None:
+            return 1, commands
+        of_parts = commands[:, :, None] + self.command_deviations
+        count, steps, parts, channels = of_parts.shape
+        return parts, of_parts.reshape(count, steps * parts, channels)
+
+    def deviations_in(self, steps: slice) -> FloatArray | None:
+        """The command deviations in a part of the steps before the window and in it."""
+        return None if self.command_deviations is None else self.command_deviations[:, steps]
 
     def take(self, which: NDArray[np.bool_] | IndexArray) -> Self:
         """Select windows by a mask (S,) or by indices (n,)."""
@@ -167,7 +184,8 @@ class PredictionWindows:
 def segments_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[RecordingSegment]:
     """Resample recordings on an even grid, cut at gaps and missing values.
 
-    Faster recordings are thinned to ``MAX_PERIOD_S`` after smoothing; commands become means over the cells.
+    Faster recordings are thinned to ``MAX_PERIOD_S`` after smoothing; commands become means over the cells, with their
+    deviations in parts of the cells where these matter.
 
     Args:
         episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined, the column
@@ -177,18 +195,25 @@ def segments_of(episodes: Sequence[EpisodeData], period_s: float | None = None) 
     Raises:
         DataError: a recording has fewer than two commands.
     """
-    found = []
     for index, episode in enumerate(episodes):
         if episode.ticks < 2:
             raise DataError(f"Recording {index + 1} has too few commands ({episode.ticks}); record at least 10 s.")
-        row_period_s = _row_period_s(episode)
-        if period_s is None:
-            period_s = row_period_s * max(int(MAX_PERIOD_S / row_period_s + 1e-6), 1)
-        every = max(round(period_s / row_period_s), 1)
-        for rows in unbroken_rows(episode):
-            segment = _segment(index, episode, rows, period_s / every, every)
-            if segment is not None:
-                found.append(segment)
+    if not episodes:
+        return []
+    row_periods_s = [row_period_s(episode.times_s, episode.period_s) for episode in episodes]
+    if period_s is None:
+        period_s = row_periods_s[0] * max(int(MAX_PERIOD_S / row_periods_s[0] + 1e-6), 1)
+    every = [max(round(period_s / row_s), 1) for row_s in row_periods_s]
+    parts = part_count(period_s, max(every))
+    found = [
+        segment
+        for index, episode in enumerate(episodes)
+        for rows in unbroken_rows(episode)
+        if (segment := _segment(index, episode, rows, period_s / every[index], every[index], parts)) is not None
+    ]
+    deviations = [segment.command_deviations for segment in found if segment.command_deviations is not None]
+    if all(np.abs(array).max(initial=0.0) < MIN_DEVIATION for array in deviations):
+        return [replace(segment, command_deviations=None) for segment in found]
     return found
 
 
@@ -206,36 +231,20 @@ def unbroken_rows(episode: EpisodeData) -> Iterable[slice]:
             yield slice(int(first), int(last))
 
 
-def _row_period_s(episode: EpisodeData) -> float:
-    """Mean time between rows without gaps where their stamps are even up to jitter and rounding, else the median."""
-    steps_s = np.diff(episode.times_s)
-    steps_s = steps_s[np.abs(steps_s - episode.period_s) < 0.5 * episode.period_s]
-    mean_s = float(np.mean(steps_s))
-    jitter_s = np.quantile(np.abs(steps_s - mean_s), 0.99)
-    return mean_s if jitter_s <= max(MAX_JITTER_SHARE * mean_s, MAX_JITTER_S) else episode.period_s
-
-
-def _even_grid(t_s: FloatArray, period_s: float) -> FloatArray:
-    """Even stamps from the first of ``t_s`` (N,) on, to the last if their period is nearly ``period_s``."""
-    duration_s = float(t_s[-1] - t_s[0])
-    steps = round(duration_s / period_s)
-    if abs(duration_s - steps * period_s) <= MAX_PERIOD_DEVIATION * duration_s:
-        return np.linspace(t_s[0], t_s[-1], steps + 1)
-    return np.asarray(t_s[0] + period_s * np.arange(int(duration_s / period_s + 1e-6) + 1))
-
-
-def _segment(index: int, episode: EpisodeData, rows: slice, period_s: float, every: int) -> RecordingSegment | None:
+def _segment(
+    index: int, episode: EpisodeData, rows: slice, period_s: float, every: int, parts: int
+) -> RecordingSegment | None:
     t = episode.times_s[rows]
     states = episode.states[rows].copy()
     states[:, 2] = np.unwrap(states[:, 2])
     commands = np.vstack([episode.sent, episode.sent[-1:]])[rows]
-    grid = _even_grid(t, period_s)
+    grid = even_grid(t, period_s)
     width = smoothing_width(period_s)
     if len(grid) < max(width, MIN_QUINTIC_WIDTH) + 2:
         return None
     if len(grid) != len(t) or np.abs(t - grid).max() > MAX_OFFSET_SHARE * period_s:
         states = np.stack([np.interp(grid, t, column) for column in states.T], axis=1)
-        commands = _cell_means(t, commands, grid, period_s)
+        commands = cell_means(t, commands, grid, period_s)
     smooth = _smoothed(states, width, 3, period_s)
     speed = np.hypot(smooth[:, 3], smooth[:, 4])
     in_event = _event_rows(t, episode.extra.get(EVENT_COLUMN, np.zeros(len(episode.times_s)))[rows], grid)
@@ -244,8 +253,9 @@ def _segment(index: int, episode: EpisodeData, rows: slice, period_s: float, eve
     residual = (states - savgol_filter(states, width, 3, axis=0))[moving]
     speed = speed[moving]
     curvature_bias = _smoothed(states, max(width, MIN_QUINTIC_WIDTH), 5, period_s) - smooth
+    whole = len(grid) // every * every
+    deviations = part_deviations(grid, commands, grid[:whole:every], every * period_s, parts)
     if every > 1:
-        whole = len(grid) // every * every
         commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
         grid, states, smooth, curvature_bias = (v[:whole:every] for v in (grid, states, smooth, curvature_bias))
         in_event = in_event[:whole:every]
@@ -261,6 +271,7 @@ def _segment(index: int, episode: EpisodeData, rows: slice, period_s: float, eve
         curvature_bias=curvature_bias,
         sampled_s=period_s,
         in_event=in_event,
+        command_deviations=deviations,
     )
 
 
@@ -286,19 +297,6 @@ def body_states(pose: FloatArray, rate: FloatArray) -> FloatArray:
     return np.column_stack([pose, *to_body(rate[:, 0], rate[:, 1], pose[:, 2]), rate[:, 2]])
 
 
-def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:
-    """Mean over [grid, grid + period) of values held from each t on."""
-    integral = np.vstack([np.zeros(2), np.cumsum(held[:-1] * np.diff(t)[:, None], axis=0)])
-
-    def upto(moments: FloatArray) -> FloatArray:
-        inside = np.clip(moments, t[0], t[-1])
-        index = np.clip(np.searchsorted(t, inside, side="right") - 1, 0, len(t) - 1)
-        past = np.clip(moments - t[-1], 0.0, None)[:, None] * held[-1]
-        return np.asarray(integral[index] + (inside - t[index])[:, None] * held[index] + past)
-
-    return (upto(grid + period_s) - upto(grid)) / period_s
-
-
 def smoothing_width(period_s: float) -> int:
     """Number of poses, odd and at least 5, that an initial state is estimated from."""
     return max(2 * round((SMOOTHING_SPAN_S / period_s - 1) / 2) + 1, 5)
@@ -312,6 +310,17 @@ def history_rows(period_s: float, seconds: float = HISTORY_S) -> int:
 def _before(values: FloatArray, row: int, period_s: float) -> FloatArray:
     """The rows (H, ...) before ``row``, with the first one where there are too few."""
     return values[np.maximum(np.arange(row - history_rows(period_s), row), 0)]
+
+
+def _deviations(starts: Sequence[tuple[RecordingSegment, int]], past: int, steps: int) -> FloatArray | None:
+    """Command deviations (S, H + K, R, 2) of windows that start at rows of segments; 0 before the stretch."""
+    found = []
+    for segment, row in starts:
+        if segment.command_deviations is None:
+            return None
+        rows = np.arange(row - past, row + steps)
+        found.append(segment.command_deviations[np.maximum(rows, 0)] * (rows >= 0)[:, None, None])
+    return np.stack(found)
 
 
 def cut_windows(
@@ -368,6 +377,7 @@ def cut_windows(
         recording=np.array([segment.recording for segment, _ in starts]),
         block=np.array([segment.recording * 1_000_000 + int(segment.t_s[row] / block_s) for segment, row in starts]),
         in_event=np.array([segment.in_event[row : row + steps + 1].any() for segment, row in starts]),
+        command_deviations=_deviations(starts, history_rows(period_s), steps),
     )
 
 

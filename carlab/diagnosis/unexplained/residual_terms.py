@@ -197,6 +197,7 @@ def _remainder(windows: PredictionWindows, predicted: FloatArray, begin: int, st
         measured=windows.measured[:, begin:],
         past_states=before[:, -past:],
         t0_s=windows.t0_s + begin * windows.period_s,
+        command_deviations=windows.deviations_in(slice(begin, None)),
     )
 
 
