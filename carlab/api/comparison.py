@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from carlab.api.cars import load_car
 from carlab.api.loaded_recordings import RecordingLike, as_list, check_contents, recordings_of_runs
 from carlab.api.loaded_recordings import load_recordings as read
-from carlab.core.errors import ConfigError, DataError
+from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -79,10 +79,8 @@ def compare(
 
 def _save(found: Comparison, folder: Path) -> None:
     from carlab.recording.atomic_files import write_text
-    from carlab.recording.sink import describe_os_error, make_folder
+    from carlab.recording.sink import make_folder, writing
 
-    try:
+    with writing(folder):
         make_folder(folder)
-    except OSError as error:
-        raise DataError(describe_os_error(error, folder)) from error
     write_text(folder / FILE_NAME, json.dumps(found.to_dict(), indent=2) + "\n")

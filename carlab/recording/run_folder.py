@@ -33,7 +33,7 @@ from typing import Any, Self
 from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.version import VERSION
-from carlab.recording.sink import describe_os_error
+from carlab.recording.sink import describe_os_error, writing
 
 _PACKAGES = (
     *("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "rerun-sdk", "mcap", "protobuf", "pyarrow"),
@@ -71,7 +71,7 @@ class RunDirectory:
         base = Path(root) / f"{stamp}_{slug}"
         if base.parent.exists() and not base.parent.is_dir():
             raise DataError(f"{base.parent} is a file, not a folder for runs; choose another folder.")
-        try:
+        with writing(base):
             base.parent.mkdir(parents=True, exist_ok=True)
             path, number = base, 1
             while not _create_folder(path):
@@ -81,8 +81,6 @@ class RunDirectory:
             run.episodes.mkdir()
             (path / "config.toml").write_text(config_toml, encoding="utf-8")
             run.write_json("environment.json", {**environment(), **(metadata or {})})
-        except OSError as error:
-            raise DataError(describe_os_error(error, base)) from error
         return run
 
     @classmethod
@@ -94,10 +92,8 @@ class RunDirectory:
                 f"{path} is not a run's folder (it has no environment.json); name one such as runs/2026-..."
             )
         run = cls(path)
-        try:
+        with writing(path):
             run.episodes.mkdir(exist_ok=True)
-        except OSError as error:
-            raise DataError(describe_os_error(error, path)) from error
         return run
 
     @contextlib.contextmanager
@@ -109,10 +105,8 @@ class RunDirectory:
             DataError: the file of the lock cannot be opened.
         """
         path = self.path / LOCK_FILE
-        try:
+        with writing(path):
             file = path.open("ab")
-        except OSError as error:
-            raise DataError(describe_os_error(error, path)) from error
         with file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -154,13 +148,11 @@ class RunDirectory:
 
     def move_to_stopped(self, recording: Path) -> None:
         """Move an episode's files into ``stopped``. Raises DataError if that fails."""
-        try:
+        with writing(self.stopped):
             self.stopped.mkdir(exist_ok=True)
             for file in (recording.with_suffix(".rrd"), recording):
                 if file.is_file():
                     os.replace(file, self.stopped / file.name)
-        except OSError as error:
-            raise DataError(describe_os_error(error, self.stopped)) from error
 
     def recordings(self, *, partial: bool = False) -> list[Path]:
         """The complete MCAP recordings in order; with ``partial`` also the incomplete ones."""
@@ -173,10 +165,8 @@ class RunDirectory:
         Raises:
             DataError: the file cannot be opened.
         """
-        try:
+        with writing(self.path / "log.jsonl"):
             handler = _LogFile(self.path / "log.jsonl", encoding="utf-8", errors="backslashreplace")
-        except OSError as error:
-            raise DataError(describe_os_error(error, self.path / "log.jsonl")) from error
         handler.setLevel(level)
         handler.setFormatter(JsonFormatter())
         return handler

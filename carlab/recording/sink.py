@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
 import shutil
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,6 +83,15 @@ def describe_os_error(error: OSError, path: Path | str) -> str:
             f"{path} could not be written because its folder does not exist; create the folder or choose another one."
         )
     return f"{path} could not be written: {error.strerror or error}; check the disk, then start again."
+
+
+@contextlib.contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """Context that writes ``path``. Raises DataError, with the remedy, in place of OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(describe_os_error(error, path)) from error
 
 
 def _disk_of(path: Path) -> str:

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from carlab.core.errors import DataError
 from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import to_dict
 from carlab.diagnosis.findings import Diagnosis, FigureData
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.recording.atomic_files import write_text
-from carlab.recording.sink import describe_os_error, make_folder
+from carlab.recording.sink import make_folder, writing
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.registry import REGISTRY
@@ -57,13 +56,11 @@ def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, mo
         HTML_NAME: render_page(diagnosis, figure_data),
         JSON_NAME: report,
     }
-    try:
+    with writing(folder):
         make_folder(folder)
         # Files of an earlier report must not stand next to new ones.
         for name in (JSON_NAME, PICTURE_NAME, DECISIONS_NAME):
             (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(describe_os_error(error, folder)) from error
     write_rrd(complete, figure_data, folder / RRD_NAME)
     if figure_data.scores_by_step:
         draw_picture(complete, figure_data, folder / PICTURE_NAME)

@@ -32,7 +32,7 @@ from carlab.recording.mcap.messages import (
     started_to_metadata,
     text,
 )
-from carlab.recording.sink import Item, Sink, claim, describe_os_error, partial_path
+from carlab.recording.sink import Item, Sink, claim, partial_path, writing
 
 CHUNK_BYTES = 16 * 1024
 
@@ -58,7 +58,7 @@ class McapSink(Sink):
         """Create the file and write its header. Raises DataError if that fails."""
         if self._file is not None or self._finished:
             return
-        try:
+        with writing(self.path):
             self._file = claim(self.path).open("xb")
             self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
             self._writer.start(profile="", library=f"carlab {VERSION}")
@@ -69,8 +69,6 @@ class McapSink(Sink):
                     topic, "protobuf", schema_id, schemas.channel_metadata(topic)
                 )
             self._file.flush()
-        except OSError as error:
-            raise DataError(describe_os_error(error, self.path)) from error
 
     def flush(self) -> None:
         """Close the current chunk and pass it to the operating system."""
@@ -148,12 +146,11 @@ def write_episode(episode: EpisodeData, path: Path | str, run_metadata: Mapping[
     names = [name for name in episode.extra if name not in OWN_COLUMNS]
     sink.open()
     try:
-        for document in documents_from_episode(episode):
-            if isinstance(document, (Tick, EpisodeEnded)) and names:
-                step = document.step if isinstance(document, Tick) else document.steps
-                sink.write_extra(step, document.t_s, {name: float(episode.extra[name][step]) for name in names})
-            sink.write(document)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
+        with writing(path):
+            for document in documents_from_episode(episode):
+                if isinstance(document, (Tick, EpisodeEnded)) and names:
+                    step = document.step if isinstance(document, Tick) else document.steps
+                    sink.write_extra(step, document.t_s, {name: float(episode.extra[name][step]) for name in names})
+                sink.write(document)
     finally:
         sink.abandon()

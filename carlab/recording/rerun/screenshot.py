@@ -14,7 +14,7 @@ from pathlib import Path
 from carlab.core.clock import monotonic_ns
 from carlab.core.errors import DataError, NotReadyError
 from carlab.recording.rerun.viewer import ADDRESS, free_port, rerun_program, wait_until_open
-from carlab.recording.sink import describe_os_error
+from carlab.recording.sink import writing
 
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 _CANNOT = "The rerun viewer cannot draw here"
@@ -77,10 +77,8 @@ def save_screenshot(
             raise NotReadyError(_CANNOT, [f"{reason}; if that is about graphics: {_NO_DRIVER}"]) from error
         finally:
             _end(viewer)
-        try:
+        with writing(png_path):
             png_path.write_bytes(picture)
-        except OSError as error:
-            raise DataError(describe_os_error(error, png_path)) from error
 
 
 def _end(viewer: subprocess.Popen[bytes]) -> None:

@@ -28,7 +28,7 @@ from carlab.recording.pipe_file import PipeFile
 from carlab.recording.rerun import blueprint as look
 from carlab.recording.rerun.columns import entity_part
 from carlab.recording.rerun.document_stream import DocumentStream
-from carlab.recording.sink import Item, Sink, claim, describe_os_error, partial_path
+from carlab.recording.sink import Item, Sink, claim, partial_path, writing
 
 _FLUSH_TIMEOUT_S = 10.0
 
@@ -64,11 +64,9 @@ class RerunSink(Sink):
         """Create the file. Raises DataError if that fails."""
         if self._opened or self._finished:
             return
-        try:
+        with writing(self.path):
             claim(self.path)
             self._file.open()
-        except OSError as error:
-            raise DataError(describe_os_error(error, self.path)) from error
         self._opened = True
 
     def flush(self) -> None:
@@ -193,9 +191,8 @@ def episode_to_rrd(
     sink = RerunSink(path, title, overlays, extent_m)
     sink.open()
     try:
-        for document in documents_from_episode(episode):
-            sink.write(document)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
+        with writing(path):
+            for document in documents_from_episode(episode):
+                sink.write(document)
     finally:
         sink.abandon()
