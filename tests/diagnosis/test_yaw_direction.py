@@ -65,3 +65,16 @@ def test_slip_in_reverse_gear_is_no_yaw_that_points_to_the_rear() -> None:
     x, y = (np.cumsum(PERIOD_S * component) for component in (np.cos(course), np.sin(course)))
     (fault,) = heading_faults(t_s, {"x": x, "y": y, "yaw": yaw})
     assert fault.evidence["offset_rad"] == pytest.approx(np.deg2rad(20.0), abs=0.03)
+
+
+@pytest.mark.parametrize("offset_deg", [-20.0, 8.0, 25.0])
+def test_yaw_offset_is_no_scale_of_true_velocities(clean: EpisodeData, offset_deg: float) -> None:
+    """The speeds along the wrong axis are smaller by the cosine of the offset."""
+    states, offset_rad = clean.states.copy(), np.deg2rad(offset_deg)
+    states[:, YAW] += offset_rad
+    (found,), _, faults = check([replace(clean, states=states, metadata={"velocity_source": "column"})], [], NOMINAL)
+    assert [(f.id, f.channel) for f in faults] == [("wrong_frame", "vx, vy")]
+    assert f"rotated by {offset_deg:.0f} degrees against the motion of the pose" in faults[0].action
+    vx, vy = clean.states[:, 3:5].T
+    along = np.cos(offset_rad) * vx + np.sin(offset_rad) * vy
+    np.testing.assert_allclose(found.states[5:-5, 3], along[5:-5], atol=0.1)

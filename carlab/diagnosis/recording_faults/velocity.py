@@ -18,6 +18,7 @@ from carlab.recording.faults.stamps import nominal_clock
 from carlab.recording.faults.velocity import (
     backward_differences,
     comparable_rows,
+    rotated_velocity,
     scale_faults,
     spike_fault,
     velocity_references,
@@ -58,6 +59,10 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
 def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
     """Frame of the velocities, then scale and spikes of each column."""
     _check_frame(repair, motion)
+    rotated = rotated_velocity(repair.states[:, 3:5].T, motion)
+    if rotated is not None:  # Which of yaw and velocities is right, the diagnosis finds by mocap_yaw_misalignment.
+        repair.states[:, 3], repair.states[:, 4] = motion.vx, motion.vy
+        repair.repaired(rotated, "vx and vy were estimated from the pose")
     for channel in VELOCITY_CHANNELS:
         _check_scale(repair, motion, channel)
     for channel in VELOCITY_CHANNELS:

@@ -65,6 +65,11 @@ class FaultSettings:
     frame_ratio: float = 0.3
     """Another frame is accepted if it leaves less than this share of what the declared frame leaves."""
 
+    rotated_rad: float = math.radians(5.0)
+    """[rad] Minimum rotation between velocities and pose that is a fault. A marker off the centre causes 3 degrees."""
+    rotated_ratio: float = 0.3
+    """A rotation is accepted if it leaves less than this share of the difference of velocities and pose."""
+
     spike_sigmas: float = 12.0
     """A spike is this far from the fit and at least ``spike_step / period``. At 8 sigma, impacts count too."""
     spike_step: tuple[float, float, float] = (0.1, 0.1, 0.25 * 2.0 * math.pi)

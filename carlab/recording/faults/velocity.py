@@ -61,6 +61,24 @@ def wrong_velocity_frame(t_s: FloatArray, velocity: FloatArray, motion: PoseMoti
     return Fault("wrong_frame", "vx, vy", observation, evidence, f"--velocity-frame {other}")
 
 
+def rotated_velocity(velocity: FloatArray, motion: PoseMotion) -> Fault | None:
+    """Find body velocities (2, N) that are those of the pose in rotated axes, as of a pose whose yaw has an offset."""
+    moving = comparable_rows(motion, "vx")
+    column, own = (velocity[0] + 1j * velocity[1])[moving], (motion.vx + 1j * motion.vy)[moving]
+    angle_rad = float(np.angle(np.vdot(own, column)))
+    error = np.abs(column - own)
+    error_rotated = np.abs(column * np.exp(-1j * angle_rad) - own)
+    is_rotated = float(np.median(error_rotated)) < LIMITS.rotated_ratio * float(np.median(error))
+    if not is_rotated or not LIMITS.rotated_rad < abs(angle_rad) < np.pi / 2.0:
+        return None
+    observation = (
+        f"vx and vy are rotated by {np.rad2deg(angle_rad):.0f} degrees against the motion of the pose: the yaw has "
+        "another axis than the velocities"
+    )
+    evidence = {"offset_rad": -angle_rad}
+    return Fault("wrong_frame", "vx, vy", observation, evidence, f"--yaw-offset {-angle_rad:.3f}")
+
+
 def unit_of_scale(channel: str, scale: float) -> str | None:
     """The unit of ``channel``, other than SI, whose numbers are ``scale`` times those in SI."""
     units = list(UNITS[channel].items())[1:]
