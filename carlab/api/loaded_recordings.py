@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -139,7 +139,7 @@ def _read_item(item: Given, role: str, latency_s: float, loaded: LoadedRecording
 
     if isinstance(item, EpisodeData):
         _check_arrays(item)
-        loaded.episodes.append(align_states(item, latency_s))
+        loaded.episodes.append(align_states(_without_corrupt_numbers(item), latency_s))
         digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
         return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
     path = item.path if isinstance(item, Recording) else item
@@ -147,14 +147,14 @@ def _read_item(item: Given, role: str, latency_s: float, loaded: LoadedRecording
         _read_csv(path, item.mapping if isinstance(item, Recording) else None, loaded)
     else:
         read = item if isinstance(item, Recording) else load(path)
-        loaded.episodes += [align_states(episode, latency_s) for episode in read.episodes]
+        loaded.episodes += [align_states(_without_corrupt_numbers(each), latency_s) for each in read.episodes]
         if read.is_recovered:
             loaded.notes.append(f"{path} {read.recovery}.")
     return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
 
 
 def _check_arrays(episode: EpisodeData) -> None:
-    """Raise DataError if the times of an episode do not increase or are not in seconds, or if a command is above 1."""
+    """Raise DataError if times do not increase or are not in seconds, or if commands exceed [-1, 1]."""
     import numpy as np
 
     from carlab.core.errors import DataError
@@ -164,11 +164,23 @@ def _check_arrays(episode: EpisodeData) -> None:
         raise DataError("times_s of an EpisodeData does not increase from row to row; sort the rows.")
     if episode.period_s > MAX_PERIOD_S:
         raise DataError(f"The rows of an EpisodeData are {episode.period_s:.4g} s apart; give times_s in seconds.")
-    if (largest := float(np.abs(episode.sent).max(initial=0.0))) > MAX_COMMAND:
+    largest = float(np.abs(np.nan_to_num(episode.sent)).max(initial=0.0))
+    if largest > MAX_COMMAND:
         raise DataError(
-            f"sent of an EpisodeData reaches {largest:.4g} where commands lie in [-1, 1]; divide steering and throttle "
-            "by their full command."
+            f"The commands of an EpisodeData reach {largest:.4g} where commands lie in [-1, 1]; divide them by the "
+            "full command."
         )
+
+
+def _without_corrupt_numbers(episode: EpisodeData) -> EpisodeData:
+    """The episode with NaN for states that no car has, and without such poses."""
+    import numpy as np
+
+    from carlab.recording.audit.file_checks import MAX_NUMBER
+
+    is_plausible = np.abs(episode.states) <= MAX_NUMBER
+    poses = episode.poses[(np.abs(episode.poses[:, 1:]) <= MAX_NUMBER).all(axis=1)]
+    return replace(episode, states=np.where(is_plausible, episode.states, np.nan), poses=poses)
 
 
 def _read_csv(path: Path, mapping: Any, loaded: LoadedRecordings) -> None:

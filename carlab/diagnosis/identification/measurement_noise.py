@@ -20,6 +20,9 @@ from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.windows import MIN_QUINTIC_WIDTH, RecordingSegment, smoothing_width
 
+MIN_SPREAD = 1e-12
+"""A channel with a smaller spread, in its SI unit, is constant but for rounding."""
+
 
 @dataclass(frozen=True, slots=True)
 class Noise:
@@ -93,7 +96,7 @@ def _deviation(
 ) -> float:
     """Standard deviation of the noise whose residual (n,) of a local cubic over ``width`` samples is ``residual``."""
     spread = STD_OVER_MAD * float(np.median(np.abs(residual)))
-    if spread == 0.0:
+    if spread < MIN_SPREAD:
         return 0.0
     limit = settings.noise_max_z * spread
     clipped = np.clip(residual, -limit, limit)
