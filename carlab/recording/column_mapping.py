@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -294,6 +295,8 @@ DART_ONBOARD = ColumnMapping(
     throttle_gate="safety_value",
     dead_reckoning=True,
 )
+_QUATERNION = re.compile(r"(orientation|rotation|quat)\w*[._ ]?w$|^q[._]?w$", re.IGNORECASE)
+"""Name of a column with the scalar part of an orientation, as motion capture and ROS export it."""
 _ORDER = (ETH, CANONICAL, DART, DART_ONBOARD)  # an export of DART data is canonical and keeps its sensors beside
 
 
@@ -331,8 +334,10 @@ def recognise_layout(header: Sequence[str], where: str, rate_hz: float | None = 
     near = difflib.get_close_matches(lacking[0].split(" (")[0], spare, n=1, cutoff=0.4)
     hint = f" (is it '{near[0]}'?)" if near else ""
     lacks_time_only = rate_hz is None and len(lacking) == 1 and nearest.columns["t"].name not in header
-    rate = "give the rate of the rows with --rate, " if lacks_time_only else ""
+    steps = "give the rate of the rows with --rate, " if lacks_time_only else ""
+    if "yaw" in lacking and any(_QUATERNION.search(name) for name in header):
+        steps += "compute yaw from the quaternion as atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)), "
     raise DataError(
         f"{where} has no column {', '.join(lacking)}{hint}; it holds {', '.join(header)}; "
-        f"{rate}say which column is which with carlab import --mapping FILE.toml, or add the column."
+        f"{steps}say which column is which with carlab import --mapping FILE.toml, or add the column."
     )

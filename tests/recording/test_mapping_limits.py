@@ -9,7 +9,7 @@ import pytest
 
 import carlab
 from carlab.core.errors import ConfigError, DataError
-from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD, load_mapping
+from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD, load_mapping, recognise_layout
 from carlab.recording.csv.foreign import import_csv
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
@@ -114,3 +114,16 @@ def test_rate_replaces_the_time_column_of_a_known_layout(drive, tmp_path):
         carlab.load(named, rate=30.0)
     with pytest.raises(ConfigError, match="'rate_hz' in the mapping's options must be a number, not 'fast'"):
         carlab.load(path, rate="fast")
+
+
+@pytest.mark.parametrize("name", ["field.pose.orientation.w", "qw", "q_w", "rotation_w", "Quat W"])
+def test_quaternion_instead_of_yaw_has_the_formula_as_remedy(name):
+    header = ["t", "x", "y", name, "steering", "throttle"]
+    with pytest.raises(DataError, match=r"has no column yaw.*compute yaw from the quaternion as atan2\(2 \(w z"):
+        recognise_layout(header, "drive.csv")
+
+
+def test_other_columns_are_no_quaternion():
+    with pytest.raises(DataError) as error:
+        recognise_layout(["t", "x", "y", "view", "raw", "steering", "throttle"], "drive.csv")
+    assert "quaternion" not in str(error.value)
