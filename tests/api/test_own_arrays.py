@@ -46,7 +46,7 @@ def test_other_arrays_than_those_of_numpy_are_refused(episode: EpisodeData, name
 def test_commands_in_other_units_are_refused_as_in_a_csv(episode: EpisodeData) -> None:
     percent = replace(episode, sent=100.0 * episode.sent)
     for call in (carlab.predict, carlab.diagnose):
-        with pytest.raises(DataError, match=r"reaches 10 where commands lie in \[-1, 1\]; divide steering"):
+        with pytest.raises(DataError, match=r"reach 10 where commands lie in \[-1, 1\]; divide them"):
             call(percent, "sim")
 
 
