@@ -93,4 +93,5 @@ def _secants(fitter: Fitter, joint: Fit, sizes: FloatArray, white: FloatArray) -
 
 def _estimate(p: FitParameter, z: float, std: float, z90: float) -> Estimate:
     low, value, high = (float(p.value(np.array(z + k * std))) for k in (-z90, 0.0, z90))
-    return Estimate(value, float(std * p.size), min(low, high), max(low, high), REGISTRY[p.name].unit)
+    unit, at_limit = REGISTRY[p.name].unit, low == high  # the whole interval lies outside the range
+    return Estimate(value, float(std * p.size), min(low, high), max(low, high), unit, at_limit)

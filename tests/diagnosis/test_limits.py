@@ -86,6 +86,15 @@ def test_limit_contains_a_small_effect_that_has_no_name(effect: str, name: str, 
     assert abs(limit.value) > 3.0 * limit.std
 
 
+def test_interval_beyond_the_range_of_a_number_is_marked(correct: ScoredSearch) -> None:
+    """A car that acts 30 ms earlier than its file states seems to have a negative lag."""
+    late = replace(CAR, command_delay_s=CAR.command_delay_s + 0.03)
+    found = replace(correct.found, base=replace(correct.fit, config=late), best=replace(correct.fit, config=late))
+    problem = replace(correct.problem, nominal=late)
+    limit = effect_limits(replace(correct, problem=problem, found=found, fit=found.best))["steering_delay"]["delay"]
+    assert (limit.value, limit.low90, limit.high90, limit.at_limit) == (0.0, 0.0, 0.0, True)
+
+
 def test_effects_without_a_linear_estimate_are_omitted(limits: dict[str, dict[str, Estimate]]) -> None:
     """A patch and a slope without size have no place; a limit of infinity has no slope."""
     assert not {"low_friction_patch", "road_slope", "steering_rate_limit", "motor_saturation"} & set(limits)
@@ -103,6 +112,8 @@ def test_report_states_the_narrowest_limits(limits: dict[str, dict[str, Estimate
     assert f"for example {CATALOGUE[narrowest].name} beyond {number(ends[narrowest])}" in sentence
     stated = {f"effects.{narrowest}.{CATALOGUE[narrowest].parameters[0].name}": 0.1}
     assert CATALOGUE[narrowest].name not in verdict_sentence(replace(diagnosis, car_file_parameters=stated))
+    beyond = {name: replace(e, at_limit=True) for name, e in limits[narrowest].items()}
+    assert CATALOGUE[narrowest].name not in verdict_sentence(replace(diagnosis, limits={**limits, narrowest: beyond}))
     page = render_page(diagnosis, FigureData())
     assert page.count("Limits of the other effects") == 1
     for effect, own in limits.items():

@@ -11,15 +11,17 @@ from sim_backends.effects import EFFECTS
 def excluded_sizes(diagnosis: Diagnosis) -> str:
     """The narrowest limits, in typical sizes of the effects; empty without any.
 
-    Only effects that the car file does not state, with a single number, which is 0 without the effect.
+    Only effects that the car file does not state, with a single number, which is 0 without the effect. An interval
+    beyond the range of the number is an error of the model.
     """
     found = []
     for effect, own in diagnosis.limits.items():
-        numbers = [p for p in EFFECTS[effect].parameters if p.name in own]
-        is_stated = any(f"effects.{effect}.{name}" in diagnosis.car_file_parameters for name in own)
-        if len(numbers) == 1 and numbers[0].identity == 0.0 and not is_stated:
-            estimate = own[numbers[0].name]
-            found.append((_largest(estimate) / abs(numbers[0].typical), EFFECTS[effect].name, estimate))
+        number = EFFECTS[effect].parameters[0]
+        is_stated = f"effects.{effect}.{number.name}" in diagnosis.car_file_parameters
+        if len(own) > 1 or number.identity != 0.0 or is_stated or own[number.name].at_limit:
+            continue
+        estimate = own[number.name]
+        found.append((_largest(estimate) / abs(number.typical), EFFECTS[effect].name, estimate))
     narrowest = sorted(found, key=lambda each: each[0])[: DEFAULT.report.max_limits]
     if not narrowest:
         return ""
