@@ -17,7 +17,7 @@ from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit_without_each
-from carlab.diagnosis.selection.search import restrict
+from carlab.diagnosis.selection.search import with_model
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 
@@ -95,7 +95,10 @@ def _with_standing_effects(
         numbers = ", ".join(f"{c.setting} {c.statistic:.3g}" for (c, *_) in removed[weakest][1])
         log.info("%s: withdrawn (%s)", weakest, numbers)
         model = removed[weakest][0]
-    return found if model.effects == found.effects else restrict(problem, found, model.effects, control)
+    if model.effects == found.effects:
+        return found
+    # A refit from the first fit could end in another optimum, whose effects were not judged.
+    return with_model(problem, found, model, control) if model.effects else found.without_effects()
 
 
 def _margin(alternatives: Alternatives) -> float:

@@ -126,3 +126,18 @@ def test_effect_that_raises_both_held_out_errors_is_withdrawn(scored: ScoredSear
     held_out = HeldOut(windows, 3.0 * STD, Noise(STD, STD))
     confirmed = without_harmful_effects(problem, found, held_out, RunControl())
     assert confirmed.effects == ((LAG, BRAKE) if stands else (LAG,))
+
+
+def test_remaining_effects_have_the_fit_that_was_judged(scored: ScoredSearch) -> None:
+    """After two removals, a new fit from the first one would end in another point than the one that was judged."""
+    true = replace(CAR, effects={LAG: {"time_constant": 0.05}})
+    held_out = HeldOut(cut_windows(segments_of([drive(true, 30.0, 17)]), 0.8, 0.5), 3.0 * STD, Noise(STD, STD))
+    problem, scale, names = scored.problem, scored.found.scale, (LAG, BRAKE, "torque_steer")
+    best = refit(problem, names, problem.fitter(scale).fit(CAR, ()), scale).fit
+    found = replace(scored.found, best=best, effects=names)
+    decisions: list[Decision] = []
+    confirmed = without_harmful_effects(problem, found, held_out, RunControl(record=decisions.append))
+    assert confirmed.effects == (LAG,)
+    without = refit(problem, (), confirmed.best, scale).fit
+    scores = [held_out.score(held_out.final_error(fit.config)) for fit in (without, confirmed.best)]
+    assert decisions[-1].alternatives[0][0].statistic == pytest.approx(scores[0] / scores[1] - 1.0, rel=1e-9)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each, eliminate
 from carlab.diagnosis.selection.forward import Path, best_path, extend
 from carlab.diagnosis.selection.pairwise_tests import choose_confusable, compare_pairs
-from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
+from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import fit_base, refit
 from carlab.diagnosis.selection.shared_delays import replace_shared_delays
 
@@ -53,14 +53,17 @@ def restrict(problem: SearchProblem, found: SearchResult, names: tuple[str, ...]
     """The result with only ``names`` of its effects, refitted."""
     if not names:
         return found.without_effects()
-    model = refit(problem, names, found.best, found.scale)
+    return with_model(problem, found, refit(problem, names, found.best, found.scale), control)
+
+
+def with_model(problem: SearchProblem, found: SearchResult, model: Model, control: RunControl) -> SearchResult:
+    """The result with a fit of some of its effects."""
     pairs = compare_pairs(problem, EliminationResult(model, delete_each(problem, model, control)), control)
-    history = tuple((name, step) for name, step in found.history if name in names)
     return replace(
         found,
         best=model.fit,
-        effects=names,
+        effects=model.effects,
         chi2=pairs.chi2,
         indistinguishable=pairs.indistinguishable,
-        history=history,
+        history=tuple((name, step) for name, step in found.history if name in model.effects),
     )
