@@ -81,7 +81,7 @@ class DiagnosisReport:
 
     @property
     def limits(self) -> dict[str, dict[str, Estimate]]:
-        """How large each effect without a name can be, by id and number: linear estimates with 90 % intervals."""
+        """How large each effect that is not named can be, by id and parameter: linear estimates with 90 % intervals."""
         return {effect: dict(own) for effect, own in self.diagnosis.limits.items()}
 
     @property

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import DataFault, RecordingUse
 
-Given: TypeAlias = "Recording | EpisodeData | Path"
-RecordingLike: TypeAlias = "Given | str"
+RecordingSource: TypeAlias = "Recording | EpisodeData | Path"
+RecordingLike: TypeAlias = "RecordingSource | str"
 """A Recording, an EpisodeData, or the path of an MCAP, a CSV or a run's folder."""
 REPORTED_FAULTS = (
     *("yaw_wrap_spikes", "outliers", "stale_samples", "clock_drift", "column_shift", "column_scale"),
@@ -38,7 +38,7 @@ class LoadedRecordings:
     notes: list[str] = field(default_factory=list)
 
 
-def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[Given]:
+def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingSource]:
     """Recordings as a list, with strings converted to paths. Raises ConfigError for another type."""
     from carlab.core.episode_data import EpisodeData
     from carlab.core.errors import ConfigError
@@ -54,11 +54,13 @@ def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[Given]:
     return [Path(item) if isinstance(item, str) else item for item in items]
 
 
-def assigned(recordings: list[Given], held_out: list[Given]) -> tuple[list[Given], list[Given]]:
+def assigned(
+    recordings: list[RecordingSource], held_out: list[RecordingSource]
+) -> tuple[list[RecordingSource], list[RecordingSource]]:
     """Recordings to fit and to hold out, with run folders resolved. Raises ConfigError if one is both."""
     if not recordings:
         raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
-    to_fit: list[Given] = []
+    to_fit: list[RecordingSource] = []
     to_validate = list(held_out)
     for item in recordings:
         fitted, validated = _episodes_of_run(item)
@@ -70,9 +72,11 @@ def assigned(recordings: list[Given], held_out: list[Given]) -> tuple[list[Given
     return to_fit, to_validate
 
 
-def recordings_of_runs(first: list[Given], second: list[Given]) -> tuple[list[Given], list[Given]]:
+def recordings_of_runs(
+    first: list[RecordingSource], second: list[RecordingSource]
+) -> tuple[list[RecordingSource], list[RecordingSource]]:
     """Two groups with run folders replaced by their episodes. Raises ConfigError if a recording is in both."""
-    groups: list[list[Given]] = []
+    groups: list[list[RecordingSource]] = []
     for items in (first, second):
         resolved = [_episodes_of_run(item) for item in items]
         groups.append([recording for fitted, validated in resolved for recording in (*fitted, *validated)])
@@ -83,7 +87,7 @@ def recordings_of_runs(first: list[Given], second: list[Given]) -> tuple[list[Gi
     return groups[0], groups[1]
 
 
-def _check_repetition(items: Iterable[Given]) -> None:
+def _check_repetition(items: Iterable[RecordingSource]) -> None:
     """Raise ConfigError if a file is given twice, for example by itself and by its run folder."""
     known: set[Path] = set()
     for path in (_path_of(item) for item in items):
@@ -101,11 +105,11 @@ def check_contents(uses: Iterable[RecordingUse]) -> None:
         known[use.sha256] = use.path
 
 
-def _paths_of(items: Iterable[Given]) -> set[Path]:
+def _paths_of(items: Iterable[RecordingSource]) -> set[Path]:
     return {path.resolve() for item in items if (path := _path_of(item))}
 
 
-def _episodes_of_run(item: Given) -> tuple[Sequence[Given], Sequence[Given]]:
+def _episodes_of_run(item: RecordingSource) -> tuple[Sequence[RecordingSource], Sequence[RecordingSource]]:
     """Episodes of a run folder to fit and to hold out (every third); for others the recording itself, to fit."""
     if not isinstance(item, Path) or not (item / "episodes").is_dir():
         return [item], []
@@ -117,11 +121,11 @@ def _episodes_of_run(item: Given) -> tuple[Sequence[Given], Sequence[Given]]:
     return [p for k, p in enumerate(driven) if k % 3 != 2], driven[2::3]
 
 
-def _path_of(item: Given) -> Path | None:
+def _path_of(item: RecordingSource) -> Path | None:
     return item.path if isinstance(item, Recording) else item if isinstance(item, Path) else None
 
 
-def load_recordings(items: list[Given], role: str, latency_s: float) -> LoadedRecordings:
+def load_recordings(items: list[RecordingSource], role: str, latency_s: float) -> LoadedRecordings:
     """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
     loaded = LoadedRecordings()
     for item in items:
@@ -130,7 +134,7 @@ def load_recordings(items: list[Given], role: str, latency_s: float) -> LoadedRe
     return loaded
 
 
-def _read_item(item: Given, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
+def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
     """Add the episodes of one recording."""
     from carlab.api.recordings import load
     from carlab.core.episode_data import EpisodeData

@@ -259,8 +259,8 @@ class Diagnosis:
     with a discrepancy also with_discrepancy. ``held_out_with_events`` has the same models, scored with the windows that
     events left out; empty without such windows. ``fitted_score`` is that of with_effects on the windows that were
     fitted; NaN if unknown. ``car_file_parameters`` has the value of each of the ``parameters`` in
-    the car file, if it states one. ``limits`` has the numbers that each effect without a name may have, by effect and
-    number. ``curve_trial`` is None without measured curves as a stage, and if the user ended it.
+    the car file, if it states one. ``limits`` has estimates of the effects that are not named, by effect and
+    parameter. ``curve_trial`` is None without measured curves as a stage, and if the user ended it.
     """
 
     verdict: Verdict

@@ -1,8 +1,8 @@
-"""Sizes that an effect without a name may have: how strong an effect the recordings would have shown.
+"""Estimates of the effects that a diagnosis does not name: how large each of them can be.
 
 The estimate is one Gauss-Newton step from the identity of the effect, together with the other parameters of the fit (a
-score test, Rao 1948). The slope is that of the secant to a finite size, because a dead band has no slope at its
-identity. It is the size at which the resulting interval ends.
+score test, Rao 1948). The slope is that of a secant from the identity to the end of the resulting interval, because a
+dead band has no slope at its identity.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from carlab.diagnosis.settings import EvidenceSettings
 from sim_backends.effects import CATALOGUE
 from sim_backends.registry import REGISTRY
 
-SECANT_ROUNDS = 3
-"""Number of times that the secant ends where the interval ends."""
+SECANT_ITERATIONS = 3
+"""Number of iterations in which the secants are evaluated at the ends of the intervals of the iteration before."""
 MIN_SIZE = 1e-9
 """Size of a coordinate below which it is at the end of its range."""
 MIN_INFORMATION = 1e-6
-"""Mean square change of the whitened errors per typical size below which a number has no influence."""
+"""Mean square change of the whitened errors per typical size below which a parameter has no influence."""
 
 
 def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
-    """Estimates of the numbers of each candidate that is not named, by effect and number.
+    """Estimates of the parameters of each candidate effect that is not named, by effect and parameter.
 
-    Effects are omitted if a number of theirs has an infinite identity, or no influence at the identities of the others.
+    An effect is omitted if one of its parameters has an infinite identity, or no influence at the identities of the
+    others.
     """
     problem, found = scored.problem, scored.found
     fitter = problem.fitter(found.scale)
@@ -57,27 +58,27 @@ def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
 def _limits(fitter: Fitter, joint: Fit, linearised: Linearisation, settings: EvidenceSettings) -> dict[str, Estimate]:
     """Estimates of the last coordinates of ``joint``, which ``linearised`` lacks; empty if one has no influence."""
     count = len(linearised.jacobian)
-    added = joint.free[count:]
-    sizes = np.ones(len(added))
-    for _ in range(SECANT_ROUNDS):
+    own = joint.free[count:]
+    sizes = np.ones(len(own))
+    for _ in range(SECANT_ITERATIONS):
         secants = _secants(fitter, joint, sizes, linearised.white)
         if np.mean(secants**2, axis=(1, 2, 3)).min(initial=math.inf) < MIN_INFORMATION:
             return {}
         jacobian = np.concatenate([linearised.jacobian, secants])
         step = fitter.gauss_newton_step(joint, Linearisation(jacobian, linearised.white))
-        left = linearised.white + np.tensordot(step, jacobian, axes=1)
-        covariance = fitter.with_covariance(joint, Linearisation(jacobian, left)).covariance
+        residual = linearised.white + np.tensordot(step, jacobian, axes=1)
+        covariance = fitter.with_covariance(joint, Linearisation(jacobian, residual)).covariance
         assert covariance is not None
         std = settings.interval_factor * np.sqrt(np.diag(covariance)[count:])
         sizes = np.abs(step[count:]) + settings.interval_z * std
-    estimates = [_estimate(p, z, s, settings.interval_z) for p, z, s in zip(added, step[count:], std, strict=True)]
-    return {p.name.rpartition(".")[2]: estimate for p, estimate in zip(added, estimates, strict=True)}
+    estimates = [_estimate(p, z, s, settings.interval_z) for p, z, s in zip(own, step[count:], std, strict=True)]
+    return {p.name.rpartition(".")[2]: estimate for p, estimate in zip(own, estimates, strict=True)}
 
 
 def _secants(fitter: Fitter, joint: Fit, sizes: FloatArray, white: FloatArray) -> FloatArray:
     """Changes (n, S, U, 6) of the whitened errors per unit of each of the last n coordinates, at the sizes (n,).
 
-    The mean of both signs, if the range of the number allows both.
+    The mean of both signs, if the range of the parameter allows both.
     """
     secants = []
     for k, size in enumerate(sizes, start=len(joint.free) - len(sizes)):

@@ -27,7 +27,11 @@ def row_period_s(t_s: FloatArray, median_s: float) -> float:
 
 
 def even_grid(t_s: FloatArray, period_s: float) -> FloatArray:
-    """Even stamps from the first of ``t_s`` (N,) on, to the last if their period is nearly ``period_s``."""
+    """Even stamps that begin at the first of ``t_s`` (N,).
+
+    They end at the last stamp if this changes the period by at most ``MAX_PERIOD_DEVIATION``. Otherwise they are
+    exactly ``period_s`` apart.
+    """
     duration_s = float(t_s[-1] - t_s[0])
     steps = round(duration_s / period_s)
     if abs(duration_s - steps * period_s) <= MAX_PERIOD_DEVIATION * duration_s:
@@ -59,10 +63,10 @@ def cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: floa
     """Mean over [grid, grid + period) of values held from each t on."""
     integral = np.vstack([np.zeros(2), np.cumsum(held[:-1] * np.diff(t)[:, None], axis=0)])
 
-    def upto(moments: FloatArray) -> FloatArray:
+    def integral_to(moments: FloatArray) -> FloatArray:
         inside = np.clip(moments, t[0], t[-1])
         index = np.clip(np.searchsorted(t, inside, side="right") - 1, 0, len(t) - 1)
         past = np.clip(moments - t[-1], 0.0, None)[:, None] * held[-1]
         return np.asarray(integral[index] + (inside - t[index])[:, None] * held[index] + past)
 
-    return (upto(grid + period_s) - upto(grid)) / period_s
+    return (integral_to(grid + period_s) - integral_to(grid)) / period_s

@@ -304,7 +304,7 @@ class SenderLoop:
 def _time_suspended_s() -> float:
     """Time for which the computer has been suspended [s]; ``time.monotonic`` stands still meanwhile (Linux).
 
-    A pause of this process between the two readings makes it smaller, never larger.
+    If this process is interrupted between the two readings, the result is too small.
     """
     return time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()
 

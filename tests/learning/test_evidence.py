@@ -36,7 +36,7 @@ class Polynomial:
         return (parameters @ self.features(inputs).T)[:, :, None]
 
 
-def most_likely_noise(features, y):
+def noise_of_maximum_evidence(features, y):
     """Maximum a posteriori of the noise with the coefficients integrated out."""
 
     def loss(log_noise):
@@ -59,5 +59,5 @@ def test_noise_of_few_rows_maximises_the_evidence(size, count):
             simulator, x, torch.tensor(y[:, None]).float(), UNITS, torch.tensor([NOISE]), with_discrepancy=False,
             seed=seed,
         )  # fmt: skip
-        ratios.append(float(posterior.noise_std) / most_likely_noise(features, y))
+        ratios.append(float(posterior.noise_std) / noise_of_maximum_evidence(features, y))
     assert math.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.03)

@@ -16,7 +16,7 @@ PARAMETERS = (EffectParameter("coefficient", "N", 0.0, -1.0, 1.0, 0.03),)
 
 @pytest.mark.parametrize(("kind", "method"), [(DynamicsEffect, "on_body"), (ObservationEffect, "observe")])
 def test_effect_that_changes_nothing_is_refused(kind: type[Effect], method: str) -> None:
-    """A method with a misspelt name is never called."""
+    """No method of the base class calls a method with a misspelt name."""
     content = {"id": "misspelt", "parameters": PARAMETERS, "on_bodies": lambda *arguments: None}
     misspelt = type("Misspelt", (kind,), content)()
     with pytest.raises(ConfigError, match=f"changes nothing; define at least one of .*{method}"), registered(misspelt):

@@ -11,17 +11,17 @@ from sim_backends.effects import EFFECTS
 def excluded_sizes(diagnosis: Diagnosis) -> str:
     """The narrowest limits, in typical sizes of the effects; empty without any.
 
-    Only effects that the car file does not state, with a single number, which is 0 without the effect. An interval
-    beyond the range of the number is an error of the model.
+    Only effects that the car file does not state, with a single parameter, which is 0 without the effect. An interval
+    beyond the range of the parameter is an error of the model.
     """
     found = []
     for effect, own in diagnosis.limits.items():
-        number = EFFECTS[effect].parameters[0]
-        is_stated = f"effects.{effect}.{number.name}" in diagnosis.car_file_parameters
-        if len(own) > 1 or number.identity != 0.0 or is_stated or own[number.name].at_limit:
+        parameter = EFFECTS[effect].parameters[0]
+        is_stated = f"effects.{effect}.{parameter.name}" in diagnosis.car_file_parameters
+        if len(own) > 1 or parameter.identity != 0.0 or is_stated or own[parameter.name].at_limit:
             continue
-        estimate = own[number.name]
-        found.append((_largest(estimate) / abs(number.typical), EFFECTS[effect].name, estimate))
+        estimate = own[parameter.name]
+        found.append((_largest(estimate) / abs(parameter.typical), EFFECTS[effect].name, estimate))
     narrowest = sorted(found, key=lambda each: each[0])[: DEFAULT.report.max_limits]
     if not narrowest:
         return ""
