@@ -10,6 +10,7 @@ import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
+from carlab.diagnosis.identification.block_jackknife import interval_quantile
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.identification.fit_parameters import FitParameter, stated_values
 from carlab.diagnosis.identification.held_out_errors import HeldOut
@@ -172,16 +173,23 @@ def estimate(scored: ScoredSearch, name: str) -> Estimate:
     index = [f.name for f in fit.free].index(name)
     free, z = fit.free[index], float(fit.z[index])
     assert fit.covariance is not None
-    z90 = settings.interval_z
-    factor = settings.joint_interval_factor if scored.is_joint else settings.interval_factor
+    z90 = interval_quantile(len(np.unique(scored.problem.windows.block)), settings.interval_probability)
     min_relative_std = settings.joint_min_relative_std if scored.is_joint else settings.min_relative_std
-    std_z = factor * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
+    std_z = standard_error_factor(scored) * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
     low, value, high = (float(free.value(np.array(z + k * std_z))) for k in (-z90, 0.0, z90))
     margin = z90 * math.hypot(min_relative_std * abs(value), _model_error_std(scored, free, value))
     low = max(value - math.hypot(value - min(low, high), margin), free.low)
     high = min(value + math.hypot(max(low, high) - value, margin), free.high)
     at_limit = not free.choice and value in (free.low, free.high)
     return Estimate(value, (high - low) / (2 * z90), low, high, REGISTRY[name].unit, at_limit)
+
+
+def standard_error_factor(scored: ScoredSearch) -> float:
+    """Factor on the standard errors of the fit with all effects."""
+    settings = scored.problem.settings.evidence
+    if scored.is_joint:
+        return settings.joint_interval_factor
+    return settings.interval_factor + scored.excess * (settings.model_interval_factor - settings.interval_factor)
 
 
 def _model_error_std(scored: ScoredSearch, free: FitParameter, value: float) -> float:

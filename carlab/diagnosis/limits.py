@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.evidence import ScoredSearch
+from carlab.diagnosis.evidence import ScoredSearch, standard_error_factor
 from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.identification.block_jackknife import interval_quantile
 from carlab.diagnosis.identification.fit import Fit, Fitter, Linearisation
 from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
-from carlab.diagnosis.settings import EvidenceSettings
 from sim_backends.effects import CATALOGUE
 from sim_backends.registry import REGISTRY
 
@@ -39,6 +39,7 @@ def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
     fitter = problem.fitter(found.scale)
     fit = replace(scored.fit, config=problem.config_with(found.effects))
     linearised = fitter.linearised(scored.fit)
+    z90 = interval_quantile(len(np.unique(problem.windows.block)), problem.settings.evidence.interval_probability)
     limits = {}
     for effect in CATALOGUE:
         if effect in found.effects or not problem.is_candidate(effect):
@@ -51,11 +52,13 @@ def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
                 free=(*fit.free, *free),
                 z=np.concatenate([fit.z, np.zeros(len(free))]),
             )
-            limits[effect] = _limits(fitter, joint, linearised, problem.settings.evidence)
+            limits[effect] = _limits(fitter, joint, linearised, standard_error_factor(scored), z90)
     return {effect: parameters for effect, parameters in limits.items() if parameters}
 
 
-def _limits(fitter: Fitter, joint: Fit, linearised: Linearisation, settings: EvidenceSettings) -> dict[str, Estimate]:
+def _limits(
+    fitter: Fitter, joint: Fit, linearised: Linearisation, std_factor: float, z90: float
+) -> dict[str, Estimate]:
     """Estimates of the last coordinates of ``joint``, which ``linearised`` lacks; empty if one has no influence."""
     count = len(linearised.jacobian)
     own = joint.free[count:]
@@ -69,9 +72,9 @@ def _limits(fitter: Fitter, joint: Fit, linearised: Linearisation, settings: Evi
         residual = linearised.white + np.tensordot(step, jacobian, axes=1)
         covariance = fitter.with_covariance(joint, Linearisation(jacobian, residual)).covariance
         assert covariance is not None
-        std = settings.interval_factor * np.sqrt(np.diag(covariance)[count:])
-        sizes = np.abs(step[count:]) + settings.interval_z * std
-    estimates = [_estimate(p, z, s, settings.interval_z) for p, z, s in zip(own, step[count:], std, strict=True)]
+        std = std_factor * np.sqrt(np.diag(covariance)[count:])
+        sizes = np.abs(step[count:]) + z90 * std
+    estimates = [_estimate(p, z, s, z90) for p, z, s in zip(own, step[count:], std, strict=True)]
     return {p.name.rpartition(".")[2]: estimate for p, estimate in zip(own, estimates, strict=True)}
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
+from carlab.diagnosis.identification.block_jackknife import jackknife_covariance
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
@@ -95,7 +96,7 @@ class Fit:
         z: (n,) coordinates of the parameters.
         cost: Huber loss plus prior.
         loss: (S,) Huber loss of each window.
-        covariance: (n, n) sandwich estimate of the covariance of z, clustered by block.
+        covariance: (n, n) covariance of z by the jackknife over blocks.
         design_effects: (n,) diagonal of ``covariance`` over that for independent errors.
     """
 
@@ -264,7 +265,7 @@ class Fitter:
         return Fit(fitted, free, z, cost, np.asarray(loss))
 
     def with_covariance(self, fit: Fit, linearisation: Linearisation | None = None) -> Fit:
-        """The same fit with its sandwich covariance, clustered by block (White 1980; Liang and Zeger 1986).
+        """The same fit with its covariance by the jackknife over blocks (``block_jackknife``).
 
         Args:
             fit: n parameters.
@@ -273,20 +274,18 @@ class Fitter:
         if not fit.free:
             return replace(fit, covariance=np.zeros((0, 0)), design_effects=np.zeros(0))
         jacobian, white = linearisation or self.linearised(fit)
-        normal, score = self._normal(fit, jacobian, white)
-        blocks, index = np.unique(self.windows.block, return_inverse=True)
-        clustered = np.stack([np.bincount(index, weights=row, minlength=len(blocks)) for row in score])
-        correction = len(blocks) / max(len(blocks) - 1, 1)
-        meat = correction * clustered @ clustered.T
-        bread = np.linalg.pinv(normal)
-        sandwich = bread @ meat @ bread
-        design_effects = np.diag(sandwich) / np.maximum(np.diag(bread), 1e-30)
-        return replace(fit, covariance=sandwich, design_effects=design_effects)
+        owns = [self.windows.block == block for block in np.unique(self.windows.block)]
+        parts = [self._information(jacobian[:, own], white[own]) for own in owns]
+        scores = np.array([score.sum(axis=1) for _, score in parts])
+        information = np.array([own for own, _ in parts])
+        covariance, design_effects = jackknife_covariance(information, scores, self.precision(fit.free))
+        return replace(fit, covariance=covariance, design_effects=design_effects)
 
     def gauss_newton_step(self, fit: Fit, linearisation: Linearisation) -> FloatArray:
         """Change (n,) of the coordinates of a fit that minimises the linearised loss with its prior."""
-        normal, score = self._normal(fit, *linearisation)
-        return np.asarray(-np.linalg.pinv(normal) @ (score.sum(axis=1) + self.precision(fit.free) @ fit.z))
+        information, score = self._information(*linearisation)
+        precision = self.precision(fit.free)
+        return np.asarray(-np.linalg.pinv(information + precision) @ (score.sum(axis=1) + precision @ fit.z))
 
     def leave_fold_out_loss(
         self, fit: Fit, folds: IndexArray, max_error: float, linearisation: Linearisation | None = None
@@ -324,7 +323,8 @@ class Fitter:
         """
         jacobian, white = linearisation
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
-        normal, score = self._normal(fit, jacobian, white)
+        information, score = self._information(jacobian, white)
+        normal = information + self.precision(fit.free)
         for name in np.unique(folds):
             own = folds == name
             part = jacobian[:, own].reshape(len(fit.free), -1)
@@ -343,12 +343,11 @@ class Fitter:
         white = self.white(fit.config, fit.free, fit.z[None])[0]
         return Linearisation(self.jacobian(fit.config, fit.free, fit.z, white), white)
 
-    def _normal(self, fit: Fit, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton matrix (n, n) with the prior, and each window's score (n, S)."""
+    def _information(self, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton matrix (n, n) without the prior, and each window's score (n, S)."""
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
-        flat = jacobian.reshape(len(fit.free), -1)
-        normal = (flat * weight.reshape(-1)) @ flat.T + self.precision(fit.free)
-        return normal, (jacobian * (weight * white)[None]).sum(axis=(2, 3))
+        flat = jacobian.reshape(len(jacobian), -1)
+        return (flat * weight.reshape(-1)) @ flat.T, (jacobian * (weight * white)[None]).sum(axis=(2, 3))
 
 
 def clustered_gain(before: FloatArray, after: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
@@ -361,7 +360,7 @@ def clustered_gain(before: FloatArray, after: FloatArray, windows: PredictionWin
 
 
 def design_effect_of(fit: Fit, effect: str) -> float:
-    """Design effect of an effect's parameters: sandwich over naive variance, at least one.
+    """Design effect of an effect's parameters: variance by blocks over that for independent errors, at least one.
 
     Twice the gain of several parameters is a sum of chi-squares weighted by such ratios, so their mean divides it
     (Kent 1982). The median of all parameters replaces it if that of the effect is undefined (a limit never reached).

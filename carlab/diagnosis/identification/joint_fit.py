@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.block_jackknife import jackknife_covariance
 from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter, bounded, huber
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
 from carlab.diagnosis.identification.free_initial_states import (
@@ -155,27 +156,14 @@ def _result(problem: _Problem, point: _Point, precision: FloatArray) -> Fit:
 
 
 def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariance (n, n) by the jackknife over blocks, and its diagonal over that for independent errors (n,).
-
-    Each block is left out by one Gauss-Newton step (the estimator CR3 of Bell and McCaffrey 2002). A few blocks, such
-    as those with slides, determine some parameters. The usual sandwich ignores how strongly a fit follows such blocks,
-    and is too small. Errors of a single block count as independent.
-    """
+    """Covariance (n, n) by the jackknife over blocks, and its diagonal over that for independent errors (n,)."""
     jacobian = at.projected()[0]
-    normal = _normal(jacobian, at)[0] + precision
-    independent = np.asarray(np.linalg.pinv(normal), dtype=np.float64)
-    blocks = np.unique(block)
-    if len(blocks) == 1:
-        return independent, np.ones(len(independent))
-    left_out = []
-    for each in blocks:
-        own = block == each
-        part = replace(at, white=at.white[own], weights=at.weights[own])
-        normal_of_block, gradient = _normal(jacobian[own], part)
-        left_out.append(np.linalg.lstsq(normal - normal_of_block, gradient, rcond=None)[0])
-    changes = np.array(left_out)
-    covariance = (len(blocks) - 1) / len(blocks) * changes.T @ changes
-    return covariance, np.diag(covariance) / np.maximum(np.diag(independent), 1e-30)
+    parts = [
+        _normal(jacobian[own], replace(at, white=at.white[own], weights=at.weights[own]))
+        for own in (block == each for each in np.unique(block))
+    ]
+    information, scores = (np.array(each) for each in zip(*parts, strict=True))
+    return jackknife_covariance(information, scores, precision)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """Candidates for the next effect: screening, refit, test on left-out blocks, acceptance.
 
-A gain in likelihood is divided by its design effect, the ratio of the sandwich covariance to the naive one (Kent 1982),
-because neighbouring errors are dependent. It must hold on blocks of the recording that are not fitted.
+A gain in likelihood is divided by its design effect (Kent 1982): the ratio of the covariance by blocks to that for
+independent errors, because neighbouring errors are dependent. It must hold on blocks of the recording that are not
+fitted.
 """
 
 from __future__ import annotations

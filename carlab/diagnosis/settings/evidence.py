@@ -17,12 +17,15 @@ class EvidenceSettings:
     """Second condition: minimum gain of the refit, as a share of the nominal loss."""
     parameter_score_ratio: float = 0.98
     """Third condition: maximum held-out score of the refit, as a share of the nominal score."""
-    interval_z: float = 1.6449
-    """Quantile of the normal distribution for 90 % intervals."""
+    interval_probability: float = 0.9
+    """Nominal probability of an interval."""
     interval_factor: float = 1.25
-    """Factor on the width of 90 % intervals of the sandwich covariance, which alone cover 79 % on development cases."""
+    """Factor on standard errors by blocks, because errors of neighbouring blocks are dependent too."""
+    model_interval_factor: float = 1.75
+    """The same where the error of the model exceeds the noise by far: it depends on the drive and the place
+    (docs/decisions/0037)."""
     min_relative_std: float = 0.01
-    """Minimum half width of an interval over ``interval_z``, as a share of the value: allows for model error."""
+    """Minimum standard deviation of a number as a share of its value: allows for model error."""
     joint_interval_factor: float = 1.5
     joint_min_relative_std: float = 0.002
     """The same for joint fits of parameters and initial states, whose errors are a third as large
