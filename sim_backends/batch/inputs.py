@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -41,6 +41,13 @@ def number_if_shared(value: Number) -> Number:
         if bool((value == first).all()):
             return float(first)
     return value
+
+
+def as_array(value: Number) -> Any:
+    """A tensor as an array, or as a float if it has the shape (); numbers are unchanged."""
+    if not isinstance(value, torch.Tensor):
+        return value
+    return value.numpy() if value.ndim else float(value)
 
 
 def total_delays_s(numbers: Mapping[str, Number], effects: Iterable[str]) -> tuple[Number, Number]:

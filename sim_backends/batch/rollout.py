@@ -1,23 +1,24 @@
 """Batched rollouts in torch, differentiable in states, commands and every parameter.
 
 The equations are those of ``single_track``. On a CPU the steps and their derivative are compiled to machine code
-(``compiled.advance``) on the memory of the tensors, in chunks that fit the cache. Without a gradient autograd is not
-used. On a GPU, and for second derivatives, torch's operators run.
+(``compiled.advance``) on the memory of the tensors. Without a gradient autograd is not used (``array_rollout``), and
+the cars are simulated in chunks that fit the cache. On a GPU, and for second derivatives, torch's operators run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 
 from carlab.core.planar import arc
-from sim_backends.array_ops import ARRAYS, Ops, Value
+from sim_backends.array_ops import Value
+from sim_backends.batch.array_rollout import array_rollout
 from sim_backends.batch.inputs import (
     Past,
+    as_array,
     check_shapes,
     check_values,
     number_if_shared,
@@ -26,11 +27,13 @@ from sim_backends.batch.inputs import (
 )
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.advance import CompiledCars, Row, Segment
+from sim_backends.compiled.advance import Key, advance_tensors, trace_step
+from sim_backends.compiled.machine_code import FloatRow
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops
+from sim_backends.effects import EFFECTS
 from sim_backends.measurement import MeasurementModel, filter_step
 
 CARS_AT_ONCE = 4096
@@ -100,8 +103,7 @@ def rollout(
     needs_gradient = torch.is_grad_enabled() and any(isinstance(t, torch.Tensor) and t.requires_grad for t in tensors)
     may_compile = engine == "fastest" and start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
     if needs_gradient:
-        return _Batch(config, start, commands, past, given, t0_s, max_step_s, None, may_compile).run(measured)
-    arrays = ARRAYS if may_compile else None
+        return _Batch(config, start, commands, past, given, t0_s, max_step_s, may_compile).run(measured)
     cars_at_once = CARS_AT_ONCE if start.device.type == "cpu" else max(cars, 1)
     parts = []
     with torch.no_grad():
@@ -109,9 +111,68 @@ def rollout(
             cut = slice(first, first + cars_at_once)
             own = {name: _of_cars(value, cut) for name, value in given.items()}
             earlier = None if past is None else past.cut(cut)
-            chunk = (start[cut], commands[cut], earlier, own, _of_cars(t0_s, cut), max_step_s, arrays)
-            parts.append(_Batch(config, *chunk, arrays is not None).run(measured))
+            chunk = (start[cut], commands[cut], earlier, own, _of_cars(t0_s, cut), max_step_s)
+            if may_compile and not measured and cars:
+                parts.append(Rollout(_on_arrays(config, *chunk)))
+            else:
+                parts.append(_Batch(config, *chunk, may_compile).run(measured))
     return _joined(parts)
+
+
+def _on_arrays(
+    config: SimulatorConfig,
+    start: torch.Tensor,
+    commands: torch.Tensor,
+    past: Past | None,
+    given: Mapping[str, Number],
+    t0_s: Number,
+    max_step_s: float,
+) -> torch.Tensor:
+    """States (N, T + 1, 6) of a rollout without a gradient, by compiled code on arrays."""
+    earlier = commands.new_zeros(len(start), 1, 2) if past is None else past.commands
+    states = array_rollout(
+        config,
+        {**config.values(), **{name: as_array(value) for name, value in given.items()}},
+        as_array(start.T.contiguous()),
+        as_array(torch.cat([earlier, commands], dim=1).permute(2, 1, 0).contiguous()),
+        int(commands.shape[1]),
+        before=0 if past is None else int(earlier.shape[1]),
+        past_states=None if past is None or past.states is None else as_array(past.states.permute(1, 2, 0)),
+        t0_s=as_array(t0_s),
+        max_step_s=max_step_s,
+    )
+    return torch.from_numpy(states).permute(2, 0, 1)
+
+
+def operator_rollout(
+    config: SimulatorConfig,
+    numbers: Mapping[str, Number],
+    start: FloatRow,
+    commands: FloatRow,
+    ticks: int,
+    *,
+    before: int,
+    past_states: FloatRow | None,
+    t0_s: FloatRow,
+    max_step_s: float,
+    every: int = 1,
+) -> FloatRow:
+    """``array_rollout`` by torch's operators, for ``report_evaluations``; all rows before the first tick are used."""
+    given = {name: torch.as_tensor(value, dtype=torch.from_numpy(start).dtype) for name, value in numbers.items()}
+    given.pop("timing.control_period")
+    rows = torch.from_numpy(commands).permute(2, 1, 0)
+    states = rollout(
+        config,
+        torch.from_numpy(start).T,
+        rows[:, before:],
+        history=rows[:, :before],
+        history_states=None if past_states is None else torch.from_numpy(past_states).permute(2, 0, 1),
+        values=given,
+        t0_s=torch.from_numpy(t0_s),
+        max_step_s=max_step_s,
+        engine="operators",
+    ).states
+    return states[:, ::every].permute(1, 2, 0).numpy()
 
 
 def _of_cars(value: Number, cars: slice) -> Number:
@@ -131,7 +192,7 @@ def _concatenated(parts: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 class _Piece(NamedTuple):
-    """A piece of the period in the array type of the equations."""
+    """A piece of the period with its step lengths."""
 
     start_s: Value
     length_s: Value
@@ -142,10 +203,10 @@ class _Piece(NamedTuple):
     capture_steps: int
 
     @classmethod
-    def of(cls, piece: Piece, local: Callable[[Value], Value]) -> _Piece:
-        after = None if piece.capture_after_s is None else local(piece.capture_after_s / piece.capture_steps)
-        start, length, step = (local(v) for v in (piece.start_s, piece.length_s, piece.length_s / piece.steps))
-        return cls(start, length, step, piece.steps, local(piece.has_capture), after, piece.capture_steps)
+    def of(cls, piece: Piece) -> _Piece:
+        after = None if piece.capture_after_s is None else piece.capture_after_s / piece.capture_steps
+        start, length, step = piece.start_s, piece.length_s, piece.length_s / piece.steps
+        return cls(start, length, step, piece.steps, piece.has_capture, after, piece.capture_steps)
 
 
 class _Moment(NamedTuple):
@@ -153,6 +214,22 @@ class _Moment(NamedTuple):
     memory: ActuatorState
     filtered: State
     """Measured velocities after the filter, if any."""
+
+
+class _Segment(NamedTuple):
+    """An interval with held commands; each value is a number or a row (cars,)."""
+
+    t_s: Value
+    """Time at its start [s]."""
+    commands: tuple[Value, Value]
+    """Steering and throttle in [-1, 1]."""
+    step_s: Value
+    """Length of an integration step [s]."""
+    steps: int
+    for_measurement: bool = False
+    """Whether the segment only leads to a capture: the next one starts where this one started."""
+    body: Value | None = None
+    """State of the body (6, cars) at the start; by default that at the end of the segment before."""
 
 
 class _Batch:
@@ -167,7 +244,6 @@ class _Batch:
         given: Mapping[str, Number],
         t0_s: Number,
         max_step_s: float,
-        arrays: Ops | None,
         compiled: bool,
     ) -> None:
         self.config = config
@@ -176,20 +252,17 @@ class _Batch:
         self.rows = tuple(row.contiguous() for row in start.unbind(dim=1))
         like = self.rows[0]
         self.numbers: dict[str, Number] = {**config.values(), **given}
-        self.on_arrays = arrays is not None
-        self.ops = torch_ops(like) if arrays is None else arrays
-        self.number_rows = {name: self._row(value, like) for name, value in self.numbers.items()}
-        full = {name: self._convert(row) for name, row in self.number_rows.items()}
-        self.measurement = MeasurementModel(self.ops, full, config.effects)
-        self.model = SingleTrack(self.ops, config.kind, full, config.effects)
-        self.chain = ActuatorChain(self.ops, full, config.effects)
-        self.full, self.is_compiled = full, compiled
-        self.compiled_cars: dict[bool, CompiledCars] = {}
-        self.t0_s = self._convert(self._row(t0_s, like)) if isinstance(t0_s, torch.Tensor) else t0_s
+        self.ops = torch_ops(like)
+        self.full = {name: self._row(value, like) for name, value in self.numbers.items()}
+        self.measurement = MeasurementModel(self.ops, self.full, config.effects)
+        self.model = SingleTrack(self.ops, config.kind, self.full, config.effects)
+        self.chain = ActuatorChain(self.ops, self.full, config.effects)
+        self.is_compiled = compiled
+        self.t0_s = self._row(t0_s, like) if isinstance(t0_s, torch.Tensor) else t0_s
         self.past = 0 if past is None else int(past.commands.shape[1])
         self.past_rows: list[State] = []
         if past is not None and past.states is not None:
-            self.past_rows = [tuple(map(self._convert, tick.contiguous())) for tick in past.states.permute(1, 2, 0)]
+            self.past_rows = [tuple(tick.contiguous()) for tick in past.states.permute(1, 2, 0)]
         self.ticks = int(commands.shape[1])
         parts = [commands.new_zeros(len(like), 1, 2)] if past is None else [past.commands[:, :1], past.commands]
         # (2, ticks, cars): the command before the history, the history, the commands.
@@ -199,28 +272,21 @@ class _Batch:
     def _row(value: Number, like: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(like.shape).contiguous()
 
-    def _convert(self, value: Value) -> Value:
-        """Convert a tensor to the array type of the equations."""
-        return value.numpy() if self.on_arrays and isinstance(value, torch.Tensor) else value
-
-    def _block(self, rows: Any) -> Value:
-        """Rows of six, one for each tick, as one array or tensor (ticks, 6, cars)."""
-        return np.array(rows) if self.on_arrays else torch.stack([torch.stack(row) for row in rows])
-
-    def _stacked(self, rows: Any) -> torch.Tensor:
+    @staticmethod
+    def _stacked(rows: Any) -> torch.Tensor:
         """Rows of six, one for each tick, as a tensor (ticks, 6, cars)."""
-        return torch.as_tensor(self._block(rows))
+        return torch.stack([torch.stack(row) for row in rows])
 
     def run(self, measured: bool) -> Rollout:
         latency_s = MeasurementModel(self.ops, self.numbers, self.config.effects).latency_s if measured else 0.0
         delays_s = total_delays_s(self.numbers, self.config.effects)
         plan = plan_period(self.period_s, delays_s, number_if_shared(latency_s), self.max_step_s)
         before = self.past if self.chain.has_memory or self.model.extra_states else 0
-        acting = [tuple(map(self._convert, pair)) for pair in self._acting_commands(plan, before)]
-        pieces = [_Piece.of(piece, self._convert) for piece in plan.pieces]
+        acting = self._acting_commands(plan, before)
+        pieces = [_Piece.of(piece) for piece in plan.pieces]
 
         lag_s = self.measurement.velocity_time_constant_s if measured else None
-        body: State = tuple(map(self._convert, self.rows))
+        body: State = self.rows
         extra, memory = self._initial_hidden_states(body, pieces, acting, before)
         now = _Moment((*body, *extra), memory, self.measurement.observe(body)[3:6])
         segments = list(self._segments(pieces, acting, before, measured))
@@ -250,7 +316,7 @@ class _Batch:
 
         They start in steady state. The body has the states ``past_rows``, or the velocities of the start.
         """
-        oldest = tuple(self._convert(row) for row in self.issued[:, 0])
+        oldest = self.issued[:, 0]
         memory = self.chain.settled((oldest[0], oldest[1]))
         if not self.model.extra_states:
             for k in range(before):
@@ -264,65 +330,65 @@ class _Batch:
         if not before:
             return extra, memory
         first = _Moment((*ticks[0], *extra), memory, ticks[0][3:6])
-        end = self._advance(first, list(self._history_segments(pieces, acting, self._block(ticks), t_s)), None)[-1]
+        end = self._advance(first, list(self._history_segments(pieces, acting, self._stacked(ticks), t_s)), None)[-1]
         return end.state[6:], end.memory
 
     def _history_segments(
         self, pieces: list[_Piece], acting: list[tuple[Value, ...]], ticks: Value, t_s: Value
-    ) -> Iterator[Segment]:
+    ) -> Iterator[_Segment]:
         """The pieces of the periods between the states ``ticks`` (n, 6, cars), each from the interpolated state."""
         shares = [piece.start_s * (1.0 / self.period_s) for piece in pieces]
         bodies = [ticks[:-1] + (ticks[1:] - ticks[:-1]) * share for share in shares]
         for k in range(len(ticks) - 1):
             for piece, commands, body in zip(pieces, acting, bodies, strict=True):
-                held = (Row(commands[0], k), Row(commands[1], k))
                 begin_s = t_s + k * self.period_s + piece.start_s
-                yield Segment(begin_s, held, piece.step_s, piece.steps, body=Row(body, k))
+                yield _Segment(begin_s, (commands[0][k], commands[1][k]), piece.step_s, piece.steps, body=body[k])
 
     def _segments(
         self, pieces: list[_Piece], acting: list[tuple[Value, ...]], before: int, measured: bool
-    ) -> Iterator[Segment]:
+    ) -> Iterator[_Segment]:
         """The pieces of all periods, each after its part up to the capture if that is to be measured."""
         for k in range(self.ticks):
             for piece, commands in zip(pieces, acting, strict=True):
-                held = (Row(commands[0], before + k), Row(commands[1], before + k))
+                held = commands[0][before + k], commands[1][before + k]
                 t_s = self.t0_s + k * self.period_s + piece.start_s
                 if measured and piece.capture_step_s is not None:
-                    yield Segment(t_s, held, piece.capture_step_s, piece.capture_steps, for_measurement=True)
-                yield Segment(t_s, held, piece.step_s, piece.steps)
+                    yield _Segment(t_s, held, piece.capture_step_s, piece.capture_steps, for_measurement=True)
+                yield _Segment(t_s, held, piece.step_s, piece.steps)
 
-    def _advance(self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None) -> list[_Moment]:
+    def _advance(self, now: _Moment, segments: Sequence[_Segment], lag_s: Value | None) -> list[_Moment]:
         """Integrate the car, and the filter on its measured velocities if any; the ends of the segments."""
-        if not self.is_compiled:
-            return list(self._advance_by_operators(now, segments, lag_s))
-        has_filter, states, memories = lag_s is not None, len(now.state), len(now.memory)
-        if has_filter not in self.compiled_cars:
-            self.compiled_cars[has_filter] = CompiledCars(self.config.kind, self.config.effects, self.full, has_filter)
-        cars = self.compiled_cars[has_filter]
-        carried = (*now.state, *now.memory, *(now.filtered if has_filter else ()))
-        return [
-            _Moment(end[:states], end[states : states + memories], end[-3:] if has_filter else end[3:6])
-            for end in cars.run(carried, segments)
-        ]
+        by_segment = self._by_compiled_code if self.is_compiled else self._by_operators
+        ends = []
+        for segment in segments:
+            start = now if segment.body is None else now._replace(state=(*segment.body, *now.state[6:]))
+            end = by_segment(start, segment, lag_s)
+            ends.append(end)
+            now = now if segment.for_measurement else end
+        return ends
 
-    def _advance_by_operators(
-        self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None
-    ) -> Iterator[_Moment]:
-        for t_s, (steering, throttle), step_s, steps, for_measurement, body in segments:
-            moment, held = now, (steering.value, throttle.value)
-            if body is not None:
-                moment = now._replace(state=(*body.value, *now.state[6:]))
-            for i in range(steps):
-                state, memory = integrate_held(
-                    self.model, self.chain, t_s + i * step_s, moment.state, moment.memory, held, step_s, 1
-                )
-                filtered = state[3:6]
-                if lag_s is not None:
-                    first, last = (self.measurement.observe(s[:6])[3:6] for s in (moment.state, state))
-                    filtered = filter_step(self.ops, moment.filtered, first, last, step_s, lag_s)
-                moment = _Moment(state, memory, filtered)
-            yield moment
-            now = now if for_measurement else moment
+    def _by_compiled_code(self, start: _Moment, segment: _Segment, lag_s: Value | None) -> _Moment:
+        key = Key(self.config.kind, tuple(EFFECTS[name] for name in self.config.effects), lag_s is not None)
+        states, memories = len(start.state), len(start.memory)
+        carried = (*start.state, *start.memory, *(start.filtered if key.has_filter else ()))
+        parameters = (self.full[name] for name in trace_step(key).parameters)
+        given = (*parameters, segment.step_s, *segment.commands, segment.t_s, *carried)
+        end = advance_tensors(key, segment.steps, *given)
+        return _Moment(end[:states], end[states : states + memories], end[-3:] if key.has_filter else end[3:6])
+
+    def _by_operators(self, start: _Moment, segment: _Segment, lag_s: Value | None) -> _Moment:
+        t_s, commands, step_s, steps, _, _ = segment
+        moment = start
+        for i in range(steps):
+            state, memory = integrate_held(
+                self.model, self.chain, t_s + i * step_s, moment.state, moment.memory, commands, step_s, 1
+            )
+            filtered = state[3:6]
+            if lag_s is not None:
+                first, last = (self.measurement.observe(s[:6])[3:6] for s in (moment.state, state))
+                filtered = filter_step(self.ops, moment.filtered, first, last, step_s, lag_s)
+            moment = _Moment(state, memory, filtered)
+        return moment
 
     def _acting_commands(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Steering and throttle acting in each piece of each period, each (before + ticks, cars)."""
@@ -361,7 +427,7 @@ class _Batch:
         sin, cos = torch.sin(yaw), torch.cos(yaw)
         earlier: tuple[torch.Tensor, ...] = (x + cos * forward - sin * left, y + sin * forward + cos * left, yaw + turn)
         earlier += tuple(v.expand_as(dt) for v in (vx, vy, yaw_rate))
-        earlier = MeasurementModel(torch_ops(dt), self.number_rows, self.config.effects).observe(earlier)
+        earlier = MeasurementModel(torch_ops(dt), self.full, self.config.effects).observe(earlier)
         if captured is None:
             return earlier
         index = (tick - 1 - plan.capture_periods).expand(-1, len(like))

@@ -1,4 +1,4 @@
-"""Compiled advance of a batch of cars: actuators, dynamics and the filter of measured velocities in one function.
+"""Compiled advance of cars: actuators, dynamics and the filter of measured velocities in one function.
 
 The equations (``ActuatorChain.step``, ``rk4_step``, ``filter_step``) are traced once for each kind of model and set of
 effects, and compiled to machine code: loops over segments and integration steps, and the derivative of one step.
@@ -7,18 +7,20 @@ effects, and compiled to machine code: loops over segments and integration steps
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.compiled.machine_code import (
     FloatRow,
     MachineCode,
+    SegmentTable,
+    addresses,
     compile_function,
     compile_segments,
     vector_length,
@@ -27,7 +29,7 @@ from sim_backends.compiled.tracing import Node, Tracer, gradients, needed_nodes
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.integrate import integrate_held
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects import EFFECTS, Effect
+from sim_backends.effects import Effect
 from sim_backends.effects.base import ModelKind
 from sim_backends.measurement import MeasurementModel, filter_step
 from sim_backends.registry import REGISTRY
@@ -41,8 +43,10 @@ class Key(NamedTuple):
 
     kind: ModelKind
     effects: tuple[Effect, ...]
-    has_filter: bool
+    has_filter: bool = False
     """Whether measured velocities are filtered."""
+    has_body: bool = True
+    """Whether the dynamics are simulated, and not the actuators alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +77,7 @@ class Graph:
 
 @functools.lru_cache(maxsize=256)
 def trace_step(key: Key) -> Graph:
-    """Trace one step: carried are the state of the car, of its actuators, and the filtered velocities if any."""
+    """Trace one step: carried are the states of the body and of the actuators, and the filtered velocities if any."""
     tracer = Tracer()
     ops = cast(Ops, tracer)
     ids = [effect.id for effect in key.effects]
@@ -81,10 +85,13 @@ def trace_step(key: Key) -> Graph:
     values = {name: tracer.input(name) for name in names}
     step_s, steering, throttle, t_s = (tracer.input(name) for name in ("step", "steering", "throttle", "t"))
     model, chain = SingleTrack(ops, key.kind, values, ids), ActuatorChain(ops, values, ids)
-    state = tuple(tracer.input(f"state{i}") for i in range(6 + len(model.extra_states)))
+    state = tuple(tracer.input(f"state{i}") for i in range(6 + len(model.extra_states) if key.has_body else 0))
     memory = tuple(tracer.input(f"memory{i}") for i in range(len(chain.settled((steering, throttle)))))
     filtered = tuple(tracer.input(f"filtered{i}") for i in range(3 if key.has_filter else 0))
-    after, memory_after = integrate_held(model, chain, t_s, state, memory, (steering, throttle), step_s, 1)
+    if key.has_body:
+        after, memory_after = integrate_held(model, chain, t_s, state, memory, (steering, throttle), step_s, 1)
+    else:
+        after, memory_after = (), chain.step((steering, throttle), memory, step_s)[1]
     outputs = [*after, *memory_after]
     if key.has_filter:
         measurement = MeasurementModel(ops, values, ids)
@@ -102,7 +109,8 @@ def compile_advance(key: Key, dtype: np.dtype[Any]) -> MachineCode:
     graph = trace_step(key)
     parameters = list(graph.parameters.values())
     clock = graph.step_s, graph.t_s
-    return compile_segments(parameters, graph.commands, *clock, graph.carried, BODY_ROWS, graph.outputs, dtype)
+    body_rows = BODY_ROWS if key.has_body else 0
+    return compile_segments(parameters, graph.commands, *clock, graph.carried, body_rows, graph.outputs, dtype)
 
 
 @functools.lru_cache(maxsize=512)
@@ -125,133 +133,64 @@ def compile_gradient(key: Key, wanted: tuple[bool, ...], dtype: np.dtype[Any]) -
     return compile_function([*inputs, *seeds], results, dtype)
 
 
-class Row(NamedTuple):
-    """A row of a matrix (rows, cars), or a block of (blocks, 6, cars); its address follows from that of the whole."""
-
-    matrix: Value
-    number: int
-
-    @property
-    def value(self) -> Value:
-        """The row (cars,), or the block (6, cars)."""
-        return self.matrix[self.number]
+def address(row: FloatRow) -> int:
+    """Address of the first number of an array."""
+    start: int = row.__array_interface__["data"][0]
+    return start
 
 
-class Segment(NamedTuple):
-    """An interval with held commands."""
-
-    t_s: Value
-    """Time at its start [s], () or (cars,)."""
-    commands: tuple[Row, Row]
-    """Steering and throttle in [-1, 1]."""
-    step_s: Value
-    """Length of an integration step [s], () or (cars,)."""
-    steps: int
-    for_measurement: bool = False
-    """Whether the segment only leads to a capture: the next one starts where this one started."""
-    body: Row | None = None
-    """Block (6, cars) of the state of the body at the start; by default that at the end of the segment before."""
-
-
-class CompiledCars:
-    """Advances one batch of cars: NumPy arrays in, arrays out; tensors in, tensors with a gradient out.
+def segment_table(
+    ends: NDArray[np.int64],
+    steps: int,
+    step: int,
+    time: ArrayLike,
+    commands: tuple[ArrayLike, ArrayLike],
+    bodies: ArrayLike | None = None,
+) -> NDArray[np.int64]:
+    """The table (segments, columns) of a compiled advance; addresses are () or (segments,).
 
     Args:
-        kind: Form of the model.
-        effects: Ids of its effects.
-        values: Numbers by dotted name, rows (cars,).
-        has_filter: Whether measured velocities are filtered.
+        ends: Addresses (segments,) of the blocks of the carried rows at the end.
+        steps: Number of steps of each segment.
+        step: Address of the row of the step length.
+        time: Addresses of the rows of the time at the start.
+        commands: Addresses of the rows of steering and throttle.
+        bodies: Addresses of blocks of the state of the body at the start; by default that at the end before.
     """
-
-    def __init__(self, kind: ModelKind, effects: Iterable[str], values: Mapping[str, Value], has_filter: bool) -> None:
-        self._key = Key(kind, tuple(EFFECTS[name] for name in effects), has_filter)
-        self._parameters = [values[name] for name in trace_step(self._key).parameters]
-        mass = values["vehicle.mass"]
-        self._on_arrays = isinstance(mass, np.ndarray)
-        self._cars = len(mass)
-        self._dtype = mass.dtype if self._on_arrays else np.dtype(str(mass.dtype).removeprefix("torch."))
-        self._rows = _Rows(max(self._cars, vector_length(self._dtype)), self._dtype)
-
-    def run(self, carried: Sequence[Value], segments: Sequence[Segment]) -> list[tuple[Value, ...]]:
-        """Advance ``carried`` through the segments, and return it at the end of each.
-
-        Args:
-            carried: Rows (cars,): the state of the car, of its actuators, and the filtered velocities if any.
-            segments: In the order of time.
-        """
-        if self._on_arrays:
-            ends = _run(self._key, self._parameters, carried, segments, self._rows)
-            return [tuple(block) for block in ends[:, :, : self._cars]]
-        found = []
-        for segment in segments:
-            commands = (row.value for row in segment.commands)
-            if segment.body is not None:
-                carried = (*segment.body.value, *carried[BODY_ROWS:])
-            given = (*self._parameters, segment.step_s, *commands, segment.t_s, *carried)
-            after = tuple(_Advance.apply(self._key, segment.steps, *given))  # type: ignore[no-untyped-call]
-            found.append(after)
-            carried = carried if segment.for_measurement else after
-        return found
+    table = np.empty((len(ends), SegmentTable.OUT + 1), np.int64)
+    columns = (steps, bodies is not None, step, time, *commands, ends if bodies is None else bodies, ends)
+    for k, column in enumerate(columns):
+        table[:, k] = column
+    return table
 
 
-def _run(
-    key: Key,
-    parameters: Sequence[Value],
-    carried: Sequence[Value],
-    segments: Sequence[Segment],
-    rows: _Rows,
-) -> FloatRow:
-    """Carried rows at the ends of the segments, shape (segments, carried, length of ``rows``)."""
-    code = compile_advance(key, rows.dtype)
-    inputs = np.array([rows.address(value) for value in (*parameters, *carried)], np.uint64)
-    results = np.empty((len(segments), len(carried), rows.length), rows.dtype)
-    uses_time = trace_step(key).uses_time
-    out, size = results.ctypes.data, results.strides[0]
-    lines = []
-    for k, (t_s, (steering, throttle), step_s, steps, for_measurement, body) in enumerate(segments):
-        step = rows.address(step_s)
-        time = rows.address(t_s) if uses_time else step
-        commands = rows.address_in(*steering), rows.address_in(*throttle)
-        end = out + k * size
-        start = end if body is None else rows.address_in(*body)  # without a body the code ignores the numbers
-        lines.append((steps, for_measurement, body is not None, step, time, *commands, start, end))
-    table = np.array(lines, np.uint64)
-    if segments:
-        code.call(rows.length, len(segments), inputs.ctypes.data, table.ctypes.data)
-    return results
+def advance_rows(key: Key, rows: Sequence[FloatRow], table: NDArray[np.int64]) -> None:
+    """Advance cars through the segments of a table, and write the carried rows to the addresses of their ends.
+
+    Args:
+        key: Of the compiled function.
+        rows: Contiguous rows (cars,): the parameters of the graph, and the carried rows at the start.
+        table: As of ``segment_table``.
+    """
+    if len(table):
+        inputs = addresses(rows)
+        compile_advance(key, rows[0].dtype).call(len(rows[0]), len(table), inputs.ctypes.data, table.ctypes.data)
 
 
-class _Rows:
-    """Addresses of contiguous rows of numbers and arrays; keeps the rows in memory. Short rows are repeated."""
+def advance_tensors(key: Key, steps: int, *inputs: Any) -> tuple[torch.Tensor, ...]:
+    """Carried rows after a number of steps, differentiable in the inputs: numbers or tensors (cars,) as of ``Graph``.
 
-    def __init__(self, length: int, dtype: np.dtype[Any]) -> None:
-        self.length, self.dtype = length, dtype
-        self._known: dict[float | int, tuple[Value, int]] = {}
-
-    def address(self, value: Value) -> int:
-        """Address of the row of ``value``, which is made once."""
-        key = value if isinstance(value, float) else id(value)
-        if key not in self._known:
-            row = _as_row(value, self.length, self.dtype)
-            self._known[key] = ((value, row), row.__array_interface__["data"][0])
-        return self._known[key][1]
-
-    def address_in(self, matrix: Value, index: int) -> int:
-        """Address of a row of a matrix (rows, cars), or of a block of (blocks, 6, cars)."""
-        shape: tuple[int, ...] = matrix.shape
-        if shape[-1] != self.length:
-            return self.address(matrix[index])
-        return self.address(matrix) + index * self.dtype.itemsize * math.prod(shape[1:])
+    The last input is a tensor.
+    """
+    return tuple(_Advance.apply(key, steps, *inputs))  # type: ignore[no-untyped-call]
 
 
 def _as_row(value: Value, cars: int, dtype: np.dtype[Any]) -> FloatRow:
-    """A number, array or tensor as a contiguous row, or an array (..., cars) of such rows; short rows are repeated."""
+    """A number or tensor as a contiguous row; short rows are repeated."""
     if isinstance(value, torch.Tensor):
         value = value.detach().numpy()
     if isinstance(value, np.ndarray) and value.ndim:
-        if value.shape[-1] not in (0, cars):
-            value = value[..., np.arange(cars) % value.shape[-1]]
-        return np.ascontiguousarray(value if value.size else np.zeros((*value.shape[:-1], cars)), dtype)
+        return np.ascontiguousarray(value if len(value) == cars else np.resize(value, cars), dtype)
     return np.full(cars, value, dtype)
 
 
@@ -266,10 +205,17 @@ class _Advance(torch.autograd.Function):
         length = max(cars, vector_length(dtype))
         rows = [_as_row(value, length, dtype) for value in inputs]
         parameters, (step, steering, throttle, t_s), carried = _cut(rows, len(graph.parameters))
-        times = [t_s + k * step for k in range(steps)]
-        commands = Row(steering[None], 0), Row(throttle[None], 0)
-        segments = [Segment(t, commands, step, 1) for t in times]
-        after = _run(key, parameters, carried, segments, _Rows(length, dtype))
+        times = np.array([t_s + k * step for k in range(steps)])
+        after = np.empty((steps, len(carried), length), dtype)
+        numbers = np.arange(steps)
+        table = segment_table(
+            address(after) + after.strides[0] * numbers,
+            1,
+            address(step),
+            address(times) + times.strides[0] * numbers,
+            (address(steering), address(throttle)),
+        )
+        advance_rows(key, [*parameters, *carried], table)
         ctx.key, ctx.given, ctx.times = key, [*parameters, step, steering, throttle], times
         ctx.befores = [carried, *after[:-1]]
         return tuple(torch.from_numpy(row[:cars]) for row in after[-1])

@@ -92,9 +92,9 @@ class MachineCode:
 class SegmentTable:
     """Columns of the table of segments: whole numbers, and addresses of rows."""
 
-    STEPS, FOR_MEASUREMENT, HAS_START, STEP, TIME, STEERING, THROTTLE, START, OUT = range(9)
-    """Number of steps (one or more); whether the segment is for a measurement, so that the next one starts where it
-    started; whether its first carried rows have given values at the start; then addresses."""
+    STEPS, HAS_START, STEP, TIME, STEERING, THROTTLE, START, OUT = range(8)
+    """Number of steps (one or more); whether the first carried rows have given values at the start of the segment; then
+    addresses."""
 
 
 def addresses(rows: Iterable[FloatRow]) -> NDArray[np.uint64]:
@@ -134,7 +134,7 @@ def compile_segments(
     at_segment = [writer.variable() for _ in carried]
     at_step = [writer.variable() for _ in (time, *carried)]
     before, writer.lines = writer.lines, []
-    (steps, for_measurement, has_start), (*rows, start, end) = _segment_columns(writer)
+    (steps, has_start), (*rows, start, end) = _segment_columns(writer)
     names |= {node.index: _load_row(writer, row) for node, row in zip((step, time, *held), rows, strict=True)}
     first_step = _start_of_segment(writer, start, has_start, at_segment, body_rows)
     start_time, segment = names[time.index], writer.lines
@@ -145,13 +145,14 @@ def compile_segments(
     writer.lines = body
     after = [writer.add(names[time.index], names[step.index]), *(_value(writer, o, names) for o in outputs)]
     ends = writer.lines = list[str]()
-    next_start = _end_of_segment(writer, end, for_measurement, first_step, after[1:])
+    for k, value in enumerate(after[1:]):
+        _store_row(writer, _row_of_block(writer, end, k), value)
     writer.lines = before
     rest = [
         "  br label %segments",
         "segments:",
         "  %j = phi i64 [ 0, %vector ], [ %j_next, %ends ]",
-        *_phis(writer, at_segment, "%vector", at_start, "%ends", next_start),
+        *_phis(writer, at_segment, "%vector", at_start, "%ends", after[1:]),
         f"  %place = mul i64 %j, {SegmentTable.OUT + 1}",
         "  %segment = getelementptr i64, ptr %out, i64 %place",
         *segment,
@@ -211,30 +212,17 @@ def _start_of_segment(
     writer: VectorWriter, block: Name, has_start: Name, carried: Sequence[Name], body_rows: int
 ) -> list[Name]:
     """The carried values, of which the first ``body_rows`` are those of the block if the segment has a start."""
+    is_set = writer.write(f"icmp ne i64 {has_start}, 0")
     body = [_load_row(writer, _row_of_block(writer, block, k)) for k in range(body_rows)]
-    return [*_selected(writer, has_start, body, carried[:body_rows]), *carried[body_rows:]]
-
-
-def _end_of_segment(
-    writer: VectorWriter, block: Name, for_measurement: Name, before: Sequence[Name], after: Sequence[Name]
-) -> list[Name]:
-    """Store the carried values; the next segment starts with them, or after a measurement with those before."""
-    for k, value in enumerate(after):
-        _store_row(writer, _row_of_block(writer, block, k), value)
-    return _selected(writer, for_measurement, before, after)
+    pairs = zip(body, carried, strict=False)
+    chosen = [writer.write(f"select i1 {is_set}, {writer.type} {a}, {writer.type} {b}") for a, b in pairs]
+    return [*chosen, *carried[body_rows:]]
 
 
 def _row_of_block(writer: VectorWriter, block: Name, k: int) -> Name:
     """The address of a row of a block (rows, cars)."""
     offset = writer.write(f"mul i64 %cars, {k}")
     return writer.write(f"getelementptr {writer.number}, ptr {block}, i64 {offset}")
-
-
-def _selected(writer: VectorWriter, flag: Name, yes: Sequence[Name], no: Sequence[Name]) -> list[Name]:
-    """The values ``yes`` if the whole number ``flag`` is not 0, the values ``no`` otherwise."""
-    is_set = writer.write(f"icmp ne i64 {flag}, 0")
-    pairs = zip(yes, no, strict=True)
-    return [writer.write(f"select i1 {is_set}, {writer.type} {a}, {writer.type} {b}") for a, b in pairs]
 
 
 def _load_inputs(inputs: Sequence[Node], dtype: np.dtype[Any]) -> tuple[VectorWriter, dict[int, Name]]:

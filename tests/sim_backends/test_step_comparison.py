@@ -15,7 +15,15 @@ import pytest
 import torch
 
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.advance import CompiledCars, Row, Segment, compile_advance, trace_step
+from sim_backends.compiled.advance import (
+    Key,
+    address,
+    advance_rows,
+    advance_tensors,
+    compile_advance,
+    segment_table,
+    trace_step,
+)
 from sim_backends.dynamics.integrate import rk4_step
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.dynamics.torch_ops import torch_ops
@@ -66,16 +74,19 @@ def by_operators(rows: Rows) -> Step:
 
 
 def by_compiled_step(rows: Rows) -> Step:
-    kind = rows[0].detach()
-    values = {name: torch.full_like(kind, v) for name, v in SimulatorConfig().values().items()}
+    key = Key("dynamic", ())
+    values = {name: torch.full_like(rows[0].detach(), v) for name, v in SimulatorConfig().values().items()}
+    parameters = [values[name] for name in trace_step(key).parameters]
 
     def step(rows: Rows) -> tuple[torch.Tensor, ...]:
-        on_arrays = not torch.is_grad_enabled()
-        given, numbers = ([v.detach().numpy() for v in rows], {n: v.numpy() for n, v in values.items()})
-        cars = CompiledCars("dynamic", (), numbers if on_arrays else values, has_filter=False)
-        state, commands = (given if on_arrays else rows)[:6], (given if on_arrays else rows)[6:]
-        [end] = cars.run(state, [Segment(0.0, (Row(commands[0][None], 0), Row(commands[1][None], 0)), STEP_S, 1)])
-        return tuple(map(torch.as_tensor, end))
+        if torch.is_grad_enabled():
+            return advance_tensors(key, 1, *parameters, STEP_S, *rows[6:], 0.0, *rows[:6])
+        given = [row.detach().numpy() for row in rows]
+        step_row, ends = np.full_like(given[0], STEP_S), np.empty((6, len(given[0])), given[0].dtype)
+        commands = address(given[6]), address(given[7])
+        table = segment_table(np.array([address(ends)]), 1, address(step_row), address(step_row), commands)
+        advance_rows(key, [*(p.numpy() for p in parameters), *given[:6]], table)
+        return tuple(map(torch.as_tensor, ends))
 
     return step
 
