@@ -12,15 +12,15 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 
 from carlab.core.planar import arc
 from carlab.core.quantities import FloatArray
 from carlab.prediction.step_length import step_for
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
+from sim_backends.batch.array_rollout import array_rollout
 from sim_backends.batch.inputs import with_effects_of_values
-from sim_backends.batch.rollout import Engine, rollout
+from sim_backends.batch.rollout import Engine, operator_rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, DynamicsEffect
 from sim_backends.measurement import (
@@ -126,37 +126,39 @@ def simulate_windows(
         Predicted measurements (P, S, K + 1 or U, 6) in the order and units of ``PredictiveModel``.
     """
     whole, shaped = _by_set(config, values or {})
-    sets = len(shaped["vehicle.mass"])
+    sets, count = len(shaped["vehicle.mass"]), len(windows)
     measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
-    inner = {n: shaped[n] for n in values or {} if not is_measurement_parameter(n)}
     effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
-    delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
-    inner[COMMAND_DELAY] = np.asarray(delay_s)
-    parts, commands = windows.part_commands()
-    part_s = windows.period_s / parts
-    unmeasured = replace(whole, effects=effects, control_period_s=part_s, priors={}, parameter_std={})
-    count, first = len(windows), commands.shape[1] - windows.steps * parts
+    numbers = {name: value for name, value in shaped.items() if not is_measurement_parameter(name)}
+    numbers[COMMAND_DELAY] = np.asarray(delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s))
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
-    start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
+    start = _stacked([invert(tuple(windows.initial_states.T))], sets)[0]
     origin = _origins(start, effects)
-    is_far = bool((np.abs(start - origin)[..., :3] > MAX_SINGLE_POSE).any())
-    tensor = partial(_tensor, dtype=np.float64 if in_double or is_far else np.float32)
-    earlier = _past_of_hidden_states(windows, measurement, effects, start - origin, origin, parts)
-    states = rollout(
+    is_far = bool((np.abs(start - origin)[:3] > MAX_SINGLE_POSE).any())
+    dtype = np.float64 if in_double or is_far else np.float32
+    parts, commands = windows.part_commands(dtype)
+    part_s = windows.period_s / parts
+    past = _past_of_hidden_states(windows, measurement, effects, sets)
+    unmeasured = replace(whole, effects=effects, control_period_s=part_s, priors={}, parameter_std={})
+    simulate = partial(
+        array_rollout if engine == "fastest" else operator_rollout,
         unmeasured,
-        tensor((start - origin).reshape(-1, 6)),
-        tensor(np.tile(commands[:, first:], (sets, 1, 1))),
-        history=tensor(np.tile(commands[:, :first], (sets, 1, 1))),
-        history_states=None if earlier is None else tensor(earlier),
-        values={name: tensor(np.broadcast_to(v, (sets, count)).reshape(-1)) for name, v in inner.items()},
-        t0_s=tensor(np.tile(windows.t0_s, sets)),
+        commands=commands,
+        ticks=windows.steps * parts,
+        before=windows.past_commands.shape[1] * parts,
+        t0_s=windows.t0_s.astype(dtype),
         max_step_s=longest_step_s(windows, config, values) if max_step_s is None else max_step_s,
-        engine=engine,
-    ).states[:, ::parts]
-    rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
-    rows = rows.reshape(windows.steps + 1, 6, sets, count) + np.moveaxis(origin, -1, 0)
-    trajectory: list[State] = [tuple(tick) for tick in rows]
-    return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
+        every=parts,
+    )
+    states = np.empty((windows.steps + 1, 6, sets, count))
+    for k in range(sets):
+        own = {name: _of_set(value, k, dtype) for name, value in numbers.items()}
+        at_start = start[:, k] - origin[:, k]
+        past_states = None if past is None else _in_parts(past[:, :, k] - origin[:, k], at_start, parts).astype(dtype)
+        states[:, :, k] = simulate(own, at_start.astype(dtype), past_states=past_states)
+    states += origin
+    trajectory: list[State] = [tuple(tick) for tick in states]
+    return _stacked(_measured(trajectory, windows, measurement, ticks), sets).transpose(2, 3, 0, 1)
 
 
 def longest_step_s(
@@ -167,41 +169,37 @@ def longest_step_s(
     return step_for(windows, whole.kind, shaped, whole.effects)
 
 
-def _tensor(array: FloatArray, dtype: type[np.floating[Any]]) -> torch.Tensor:
-    return torch.from_numpy(np.array(array, dtype=dtype))
+def _of_set(value: FloatArray, k: int, dtype: type[np.floating[Any]]) -> float | FloatArray:
+    """The number of parameter set k, or its row (S,), of a value (P, 1) or (P, S)."""
+    return float(value[k, 0]) if value.shape[1] == 1 else value[k].astype(dtype)
 
 
 def _past_of_hidden_states(
-    windows: PredictionWindows,
-    measurement: MeasurementModel,
-    effects: Iterable[str],
-    start: FloatArray,
-    origin: FloatArray,
-    parts: int,
+    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str], sets: int
 ) -> FloatArray | None:
-    """True states (P S, H R, 6) before windows, at R parts of each step; None if no hidden state depends on them.
-
-    States, and those at the ``start`` (P, S, 6), are less ``origin`` (P, S, 6).
-    """
+    """True states (H, 6, P, S) before windows, or None if no hidden state depends on them."""
     used = [EFFECTS[name] for name in effects]
     if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in used):
         return None
-    past = [measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)]
-    states = _stacked(past, len(origin)) - origin[:, :, None]
-    change = np.diff(states, axis=2, append=start[:, :, None])
-    share = (np.arange(parts) / parts)[:, None]
-    return np.asarray(states[:, :, :, None] + share * change[:, :, :, None]).reshape(-1, len(past) * parts, 6)
+    return _stacked([measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)], sets)
+
+
+def _in_parts(past: FloatArray, start: FloatArray, parts: int) -> FloatArray:
+    """States (H R, 6, S) at R parts of each step before windows, from states (H, 6, S) and that at the start (6, S)."""
+    change = np.diff(past, axis=0, append=start[None])
+    share = (np.arange(parts) / parts)[:, None, None]
+    return np.asarray((past[:, None] + share * change[:, None]).reshape(-1, *start.shape))
 
 
 def _origins(start: FloatArray, effects: Iterable[str]) -> FloatArray:
-    """Positions and whole turns (P, S, 6) to subtract from states (P, S, 6), which 32 bits resolve near 0 only.
+    """Positions and whole turns (6, P, S) to subtract from states (6, P, S), which 32 bits resolve near 0 only.
 
     Positions are 0 if an effect depends on the place.
     """
     origin = np.zeros_like(start)
     if not any("place" in EFFECTS[name].depends_on for name in effects):
-        origin[..., :2] = start[..., :2]
-    origin[..., 2] = 2.0 * np.pi * np.round(start[..., 2] / (2.0 * np.pi))
+        origin[:2] = start[:2]
+    origin[2] = 2.0 * np.pi * np.round(start[2] / (2.0 * np.pi))
     return origin
 
 
@@ -252,10 +250,10 @@ def _in_columns(value: float | FloatArray, sets: int) -> FloatArray:
 
 
 def _stacked(states: Sequence[State], sets: int) -> FloatArray:
-    """Stack states, six rows (P or 1, S) per tick, into one array (P, S, ticks, 6)."""
+    """Stack states, six rows (P or 1, S) per tick, into one array (ticks, 6, P, S)."""
     count = states[0][0].shape[-1]
     stacked = np.empty((len(states), 6, sets, count))
     for k, state in enumerate(states):
         for i, row in enumerate(state):
             stacked[k, i] = row
-    return stacked.transpose(2, 3, 0, 1)
+    return stacked

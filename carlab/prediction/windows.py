@@ -149,14 +149,13 @@ class PredictionWindows:
         """Length of each window."""
         return self.steps * self.period_s
 
-    def part_commands(self) -> tuple[int, FloatArray]:
-        """Number of parts R of a step, and the commands (S, (H + K) R, 2) of the parts before the window and in it."""
-        commands = np.concatenate([self.past_commands, self.commands], axis=1)
-        if self.command_deviations is None:
-            return 1, commands
-        of_parts = commands[:, :, None] + self.command_deviations
-        count, steps, parts, channels = of_parts.shape
-        return parts, of_parts.reshape(count, steps * parts, channels)
+    def part_commands(self, dtype: type[np.floating[Any]]) -> tuple[int, FloatArray]:
+        """Number of parts R of a step, and the commands (2, (H + K) R, S) of the parts before the window and in it."""
+        commands = np.concatenate([self.past_commands, self.commands], axis=1)[:, :, None]
+        if self.command_deviations is not None:
+            commands = commands + self.command_deviations
+        count, steps, parts, channels = commands.shape
+        return parts, np.ascontiguousarray(commands.reshape(count, steps * parts, channels).transpose(2, 1, 0), dtype)
 
     def deviations_in(self, steps: slice) -> FloatArray | None:
         """The command deviations in a part of the steps before the window and in it."""
