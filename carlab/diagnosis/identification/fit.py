@@ -21,7 +21,7 @@ from carlab.diagnosis.identification.fit_parameters import FitParameter, differe
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.predict import longest_step_s, simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CURVES
@@ -141,18 +141,27 @@ class Fitter:
         """Huber's loss of whitened errors (...), element by element."""
         return huber(white, self.settings.huber_delta)
 
-    def white(self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
-        """Whitened errors (P, S, U, 6) at coordinates z (P, n), in batches that bound the memory."""
+    def white(
+        self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray, max_step_s: float | None = None
+    ) -> FloatArray:
+        """Whitened errors (P, S, U, 6) at coordinates z (P, n), in batches that bound the memory.
+
+        ``max_step_s`` is the maximum integration step, by default as of ``simulate_windows``.
+        """
         if len(z) > self.settings.max_batch_sets:
             parts = np.array_split(z, math.ceil(len(z) / self.settings.max_batch_sets))
-            return np.concatenate([self.white(config, free, part) for part in parts])
-        return self._white(self.windows, config, {f.name: f.value(z[:, k]) for k, f in enumerate(free)})
+            return np.concatenate([self.white(config, free, part, max_step_s) for part in parts])
+        return self._white(self.windows, config, {f.name: f.value(z[:, k]) for k, f in enumerate(free)}, max_step_s)
 
     def _white(
-        self, windows: PredictionWindows, config: SimulatorConfig, values: Mapping[str, FloatArray]
+        self,
+        windows: PredictionWindows,
+        config: SimulatorConfig,
+        values: Mapping[str, FloatArray],
+        max_step_s: float | None,
     ) -> FloatArray:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
-            predicted = simulate_windows(windows, config, values, ticks=self.scale.steps)
+            predicted = simulate_windows(windows, config, values, ticks=self.scale.steps, max_step_s=max_step_s)
             return self.scale.white_at_steps(prediction_errors(predicted, windows, self.scale.steps))
 
     def jacobian(
@@ -160,23 +169,27 @@ class Fitter:
     ) -> FloatArray:
         """Derivatives (n, S, U, 6) of the whitened errors ``white`` (S, U, 6) at coordinates z (n,), by differences.
 
-        Only windows that a parameter may influence are simulated for it. Delays change the integration grid of their
-        batch, so they have batches of their own.
+        Only windows that a parameter may influence are simulated for it.
         """
-        influences = influencing_parameters(self.windows, config, values_at(free, z))
+        values = values_at(free, z)
+        influences = influencing_parameters(self.windows, config, values)
+        max_step_s = longest_step_s(self.windows, config, values)
         steps = difference_steps(free)
         jacobian = np.zeros((len(free), *white.shape))
-        is_delay = np.array([f.is_delay for f in free], dtype=bool)
-        for group in (np.flatnonzero(~is_delay), np.flatnonzero(is_delay)):
-            batches = math.ceil(influences[group].sum() / (max(len(self.windows), 1) * self.settings.max_batch_sets))
-            for batch in np.array_split(group, batches) if batches else ():
-                row, window = np.nonzero(influences[batch])
-                values = values_at(free, z)
-                for k, which in enumerate(batch):
-                    moved = z[which] + steps[which] * (row == k)
-                    values[free[which].name] = np.atleast_2d(free[which].value(moved))
-                changed = self._white(self.windows.take(window), config, values)[0]
-                jacobian[batch[row], window] = (changed - white[window]) / steps[batch[row], None, None]
+        everywhere = influences.all(axis=1)
+        moved = z + np.diag(steps)[everywhere]
+        if everywhere.any():
+            changed = self.white(config, free, moved, max_step_s)
+            jacobian[everywhere] = (changed - white) / steps[everywhere, None, None, None]
+        knots = np.flatnonzero(~everywhere)
+        batches = math.ceil(influences[knots].sum() / (max(len(self.windows), 1) * self.settings.max_batch_sets))
+        for batch in np.array_split(knots, batches) if batches else ():
+            row, window = np.nonzero(influences[batch])
+            of_windows = dict(values)
+            for k, which in enumerate(batch):
+                of_windows[free[which].name] = np.atleast_2d(free[which].value(z[which] + steps[which] * (row == k)))
+            changed = self._white(self.windows.take(window), config, of_windows, max_step_s)[0]
+            jacobian[batch[row], window] = (changed - white[window]) / steps[batch[row], None, None]
         return jacobian
 
     def precision(self, free: Sequence[FitParameter]) -> FloatArray:
