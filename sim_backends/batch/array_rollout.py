@@ -20,7 +20,7 @@ from sim_backends.compiled.advance import BODY_ROWS, Key, address, advance_rows,
 from sim_backends.compiled.machine_code import FloatRow, vector_length
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects import EFFECTS, ActuatorEffect
+from sim_backends.effects import ActuatorEffect
 
 IntArray = NDArray[np.int64]
 
@@ -85,7 +85,7 @@ class _ArrayRollout:
     ) -> None:
         self.commands, self.ticks, self.t0_s, self.numbers = commands, ticks, t0_s, numbers
         self.period_s = config.control_period_s
-        self.key = Key(config.kind, tuple(EFFECTS[name] for name in config.effects))
+        self.key = Key.of(config.kind, config.effects)
         as_tensors = {n: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for n, v in numbers.items()}
         delays_s = total_delays_s(as_tensors, config.effects)
         self.plan: PeriodPlan = plan_period(self.period_s, delays_s, 0.0, max_step_s)

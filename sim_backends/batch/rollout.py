@@ -33,7 +33,6 @@ from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops
-from sim_backends.effects import EFFECTS
 from sim_backends.measurement import MeasurementModel, filter_step
 
 CARS_AT_ONCE = 4096
@@ -368,7 +367,7 @@ class _Batch:
         return ends
 
     def _by_compiled_code(self, start: _Moment, segment: _Segment, lag_s: Value | None) -> _Moment:
-        key = Key(self.config.kind, tuple(EFFECTS[name] for name in self.config.effects), lag_s is not None)
+        key = Key.of(self.config.kind, self.config.effects, lag_s is not None)
         states, memories = len(start.state), len(start.memory)
         carried = (*start.state, *start.memory, *(start.filtered if key.has_filter else ()))
         parameters = (self.full[name] for name in trace_step(key).parameters)

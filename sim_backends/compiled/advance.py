@@ -7,7 +7,7 @@ effects, and compiled to machine code: loops over segments and integration steps
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
@@ -29,7 +29,7 @@ from sim_backends.compiled.tracing import Node, Tracer, gradients, needed_nodes
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.integrate import integrate_held
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects import Effect
+from sim_backends.effects import EFFECTS, DelayEffect, Effect
 from sim_backends.effects.base import ModelKind
 from sim_backends.measurement import MeasurementModel, filter_step
 from sim_backends.registry import REGISTRY
@@ -47,6 +47,12 @@ class Key(NamedTuple):
     """Whether measured velocities are filtered."""
     has_body: bool = True
     """Whether the dynamics are simulated, and not the actuators alone."""
+
+    @classmethod
+    def of(cls, kind: ModelKind, effects: Iterable[str], has_filter: bool = False) -> Key:
+        """The key of effects (ids), which act in an order of their own; delays are no part of a step."""
+        chosen = [e for e in map(EFFECTS.__getitem__, sorted(effects)) if not isinstance(e, DelayEffect)]
+        return cls(kind, tuple(chosen), has_filter)
 
 
 @dataclass(frozen=True, slots=True)

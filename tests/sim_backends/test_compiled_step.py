@@ -10,6 +10,7 @@ import torch
 from sim_backends.array_ops import FLOATS
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.compiled.advance import Key
 from sim_backends.compiled.tracing import Tracer, gradients
 from sim_backends.effects import EFFECTS
 
@@ -108,6 +109,12 @@ def test_second_derivatives_are_refused_unless_on_operators():
     loss = rollout(SimulatorConfig(), start, commands).states.square().sum()
     with pytest.raises(NotImplementedError, match="operators"):
         torch.autograd.grad(loss, commands, create_graph=True)
+
+
+def test_the_order_of_effects_and_delays_need_no_other_compiled_step():
+    key = Key.of("dynamic", ("steering_lag", "tyre_relaxation"))
+    assert Key.of("dynamic", ("tyre_relaxation", "command_delay", "steering_lag")) == key
+    assert Key.of("dynamic", ("tyre_relaxation",)) != key
 
 
 UNARY = {
