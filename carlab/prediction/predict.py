@@ -138,7 +138,7 @@ def simulate_windows(
     dtype = np.float64 if in_double or is_far else np.float32
     parts, commands = windows.part_commands(dtype)
     part_s = windows.period_s / parts
-    past = _past_of_hidden_states(windows, measurement, effects, sets)
+    past = _past_of_hidden_states(windows, measurement, effects)
     unmeasured = replace(whole, effects=effects, control_period_s=part_s, priors={}, parameter_std={})
     simulate = partial(
         array_rollout if engine == "fastest" else operator_rollout,
@@ -153,9 +153,9 @@ def simulate_windows(
     states = np.empty((windows.steps + 1, 6, sets, count))
     for k in range(sets):
         own = {name: _of_set(value, k, dtype) for name, value in numbers.items()}
-        at_start = start[:, k] - origin[:, k]
-        past_states = None if past is None else _in_parts(past[:, :, k] - origin[:, k], at_start, parts).astype(dtype)
-        states[:, :, k] = simulate(own, at_start.astype(dtype), past_states=past_states)
+        at_start = (start[:, k] - origin[:, k]).astype(dtype)
+        past_states = None if past is None else (past[:, :, k % past.shape[2]] - origin[:, k]).astype(dtype)
+        states[:, :, k] = simulate(own, at_start, past_states=past_states)
     states += origin
     trajectory: list[State] = [tuple(tick) for tick in states]
     return _stacked(_measured(trajectory, windows, measurement, ticks), sets).transpose(2, 3, 0, 1)
@@ -175,20 +175,14 @@ def _of_set(value: FloatArray, k: int, dtype: type[np.floating[Any]]) -> float |
 
 
 def _past_of_hidden_states(
-    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str], sets: int
+    windows: PredictionWindows, measurement: MeasurementModel, effects: Iterable[str]
 ) -> FloatArray | None:
-    """True states (H, 6, P, S) before windows, or None if no hidden state depends on them."""
+    """True states (H, 6, P or 1, S) before windows, or None if no hidden state depends on them."""
     used = [EFFECTS[name] for name in effects]
     if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in used):
         return None
-    return _stacked([measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)], sets)
-
-
-def _in_parts(past: FloatArray, start: FloatArray, parts: int) -> FloatArray:
-    """States (H R, 6, S) at R parts of each step before windows, from states (H, 6, S) and that at the start (6, S)."""
-    change = np.diff(past, axis=0, append=start[None])
-    share = (np.arange(parts) / parts)[:, None, None]
-    return np.asarray((past[:, None] + share * change[:, None]).reshape(-1, *start.shape))
+    past = [measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)]
+    return _stacked(past, max(np.atleast_2d(row).shape[0] for row in past[0]))
 
 
 def _origins(start: FloatArray, effects: Iterable[str]) -> FloatArray:

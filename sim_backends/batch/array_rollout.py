@@ -49,7 +49,8 @@ def array_rollout(
         ticks: T.
         before: Number of periods before the first tick, at most H, through which hidden states are simulated; they
             start in steady state.
-        past_states: States of the body at these ticks (``before``, 6, N), by default the velocities of the start.
+        past_states: States of the body (``before // every``, 6, N) at each of these ticks whose number is a multiple of
+            ``every``, linear in between; by default the velocities of the start.
         t0_s: Time of the first tick since the first row of the recording [s], a number or a row (N,).
         max_step_s: Longest Runge-Kutta step [s].
         every: States are returned at each tick whose number is a multiple of this.
@@ -64,7 +65,7 @@ def array_rollout(
         past_states = None if past_states is None else past_states[..., again]
         t0_s = t0_s[again] if isinstance(t0_s, np.ndarray) else t0_s
         start, commands = (np.ascontiguousarray(array[..., again]) for array in (start, commands))
-    rollout = _ArrayRollout(config, numbers, commands, ticks, t0_s, max_step_s)
+    rollout = _ArrayRollout(config, numbers, commands, ticks, t0_s, max_step_s, every)
     carried = rollout.carried_at_start(start, past_states, before)
     ends = np.empty((ticks // every + 2, len(carried), start.shape[1]), start.dtype)
     ends[0, :BODY_ROWS] = start
@@ -82,8 +83,9 @@ class _ArrayRollout:
         ticks: int,
         t0_s: float | FloatRow,
         max_step_s: float,
+        every: int,
     ) -> None:
-        self.commands, self.ticks, self.t0_s, self.numbers = commands, ticks, t0_s, numbers
+        self.commands, self.ticks, self.t0_s, self.numbers, self.every = commands, ticks, t0_s, numbers, every
         self.period_s = config.control_period_s
         self.key = Key.of(config.kind, config.effects)
         as_tensors = {n: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for n, v in numbers.items()}
@@ -101,9 +103,8 @@ class _ArrayRollout:
                 inputs = tuple(effect for effect in self.key.effects if isinstance(effect, ActuatorEffect))
                 memory = self._after_history(Key("dynamic", inputs, has_body=False), memory, before, None)
             return self._rows((*start, *memory))
-        bodies = np.repeat(start[None], before + 1, axis=0)
-        if past_states is not None:
-            bodies[:-1] = past_states
+        past_states = np.repeat(start[None], before // self.every, axis=0) if past_states is None else past_states
+        bodies = np.concatenate([past_states, start[None]])
         actuation = self.model.actuation(*self.chain.settled_output((steering, throttle)))
         extra = self.model.settled(self.t0_s - before * self.period_s, tuple(bodies[0]), actuation)
         carried = (*bodies[0], *extra, *memory)
@@ -137,7 +138,7 @@ class _ArrayRollout:
             ends: Blocks to which carried rows are written (blocks, carried, cars).
             blocks: Index (n,) of the block for the end of each period; ends of its other pieces go to the last block.
             first: Number of the first period; the first tick begins period 0.
-            bodies: States of the body (n + 1, 6, cars) at the ticks, from which each piece starts.
+            bodies: States of the body (n // every + 1, 6, cars), interpolated at the start of each piece.
         """
         graph, periods, pieces = trace_step(key), first + np.arange(len(blocks)), self.plan.pieces
         parameters = self._rows(tuple(self.numbers[name] for name in graph.parameters))
@@ -153,8 +154,11 @@ class _ArrayRollout:
                 time = self._addresses(self._rows(self.t0_s + self.period_s * periods[:, None] + begin_s), used)
             starts = None
             if bodies is not None:
-                starts = bodies[:-1] + np.diff(bodies, axis=0) * (begin_s / self.period_s)
-                starts = self._addresses(starts.astype(ends.dtype, copy=False), used)
+                share = np.add.outer(np.arange(self.every), begin_s / self.period_s) / self.every
+                share = share.reshape(self.every, 1, -1).astype(ends.dtype)
+                between = np.diff(bodies, axis=0)[:, None] * share
+                between += bodies[:-1, None]
+                starts = self._addresses(between.reshape(-1, *bodies.shape[1:]), used)
             step = address(steps) + k * steps.strides[0]
             block = address(ends) + ends.strides[0] * where
             tables.append(segment_table(block, piece.steps, step, time, (held[0], held[1]), starts))

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 
 from carlab.core.planar import arc
@@ -165,13 +166,20 @@ def operator_rollout(
         torch.from_numpy(start).T,
         rows[:, before:],
         history=rows[:, :before],
-        history_states=None if past_states is None else torch.from_numpy(past_states).permute(2, 0, 1),
+        history_states=None if past_states is None else _at_each_tick(past_states, start, every),
         values=given,
         t0_s=torch.from_numpy(t0_s),
         max_step_s=max_step_s,
         engine="operators",
     ).states
     return states[:, ::every].permute(1, 2, 0).numpy()
+
+
+def _at_each_tick(past_states: FloatRow, start: FloatRow, every: int) -> torch.Tensor:
+    """States (N, H every, 6) at each tick, linear between every-th states (H, 6, N) and the start (6, N)."""
+    change = np.diff(past_states, axis=0, append=start[None])[:, None]
+    states = past_states[:, None] + change * np.arange(every)[:, None, None] / every
+    return torch.from_numpy(states.reshape(-1, *start.shape)).permute(2, 0, 1)
 
 
 def _of_cars(value: Number, cars: slice) -> Number:

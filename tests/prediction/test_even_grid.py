@@ -118,3 +118,13 @@ def test_drives_of_different_rates_are_cut_together() -> None:
     assert set(windows.recording) == {0, 1}
     assert windows.command_deviations is not None
     assert np.abs(windows.command_deviations[windows.recording == 1]).max() < 1e-9
+
+
+def test_torch_operators_and_compiled_code_simulate_the_parts_of_cells_alike() -> None:
+    config = replace(CAR, effects={"tyre_relaxation": {"length": 0.15}, "steering_lag": {"time_constant": 0.05}})
+    episode = recorded(250.0, stepping(250.0, 8.0, 1), np.zeros(3), config)
+    windows = cut_windows(segments_of([episode]), 1.0, 0.5)
+    assert windows.command_deviations is not None
+    by_code = simulate_windows(windows, config, in_double=True)
+    by_operators = simulate_windows(windows, config, in_double=True, engine="operators")
+    assert np.allclose(by_code, by_operators, atol=1e-9)
