@@ -7,7 +7,7 @@ Times are those of the recording, in which commands act later by the latency of 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
@@ -128,7 +128,7 @@ def simulate_windows(
     whole, shaped = _by_set(config, values or {})
     sets, count = len(shaped["vehicle.mass"]), len(windows)
     measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
-    effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
+    effects = [name for name in whole.effects if EFFECTS[name].kind != "observation"]
     numbers = {name: value for name, value in shaped.items() if not is_measurement_parameter(name)}
     numbers[COMMAND_DELAY] = np.asarray(delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s))
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
@@ -137,17 +137,17 @@ def simulate_windows(
     is_far = bool((np.abs(start - origin)[:3] > MAX_SINGLE_POSE).any())
     dtype = np.float64 if in_double or is_far else np.float32
     parts, commands = windows.part_commands(dtype)
-    part_s = windows.period_s / parts
+    numbers["timing.control_period"] = np.full((sets, 1), windows.period_s / parts)
     past = _past_of_hidden_states(windows, measurement, effects)
-    unmeasured = replace(whole, effects=effects, control_period_s=part_s, priors={}, parameter_std={})
     simulate = partial(
         array_rollout if engine == "fastest" else operator_rollout,
-        unmeasured,
+        whole.kind,
+        effects,
         commands=commands,
         ticks=windows.steps * parts,
         before=windows.past_commands.shape[1] * parts,
         t0_s=windows.t0_s.astype(dtype),
-        max_step_s=longest_step_s(windows, config, values) if max_step_s is None else max_step_s,
+        max_step_s=step_for(windows, whole.kind, shaped, whole.effects) if max_step_s is None else max_step_s,
         every=parts,
     )
     states = np.empty((windows.steps + 1, 6, sets, count))

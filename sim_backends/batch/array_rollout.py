@@ -5,7 +5,7 @@ All segments of all control periods are one call of the compiled function: a tab
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 from sim_backends.array_ops import ARRAYS, Value
 from sim_backends.batch.inputs import as_array, total_delays_s
 from sim_backends.batch.schedule import PeriodPlan, Piece, plan_period
-from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.advance import BODY_ROWS, Key, address, advance_rows, segment_table, trace_step
 from sim_backends.compiled.machine_code import FloatRow, vector_length
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects import ActuatorEffect
+from sim_backends.effects import ActuatorEffect, DynamicsEffect
+from sim_backends.effects.base import ModelKind
 
 IntArray = NDArray[np.int64]
 
 
 def array_rollout(
-    config: SimulatorConfig,
+    kind: ModelKind,
+    effects: Iterable[str],
     numbers: Mapping[str, float | FloatRow],
     start: FloatRow,
     commands: FloatRow,
@@ -41,8 +42,9 @@ def array_rollout(
     """Simulate N cars from their initial states with commands at control ticks.
 
     Args:
-        config: The simulator.
-        numbers: All its numbers by dotted name, each a number or a row (N,); they replace those of ``config``.
+        kind: Kind of the model.
+        effects: Ids of its effects.
+        numbers: All numbers of the simulator by dotted name, each a number or a row (N,), but one control period.
         start: States at the first tick (6, N), float32 or float64, which sets the type.
         commands: Steering and throttle in [-1, 1], of the same type (2, H + T, N); the first H act before the first
             tick, and the first of all acts before it.
@@ -65,7 +67,7 @@ def array_rollout(
         past_states = None if past_states is None else past_states[..., again]
         t0_s = t0_s[again] if isinstance(t0_s, np.ndarray) else t0_s
         start, commands = (np.ascontiguousarray(array[..., again]) for array in (start, commands))
-    rollout = _ArrayRollout(config, numbers, commands, ticks, t0_s, max_step_s, every)
+    rollout = _ArrayRollout(kind, effects, numbers, commands, ticks, t0_s, max_step_s, every)
     carried = rollout.carried_at_start(start, past_states, before)
     ends = np.empty((ticks // every + 2, len(carried), start.shape[1]), start.dtype)
     ends[0, :BODY_ROWS] = start
@@ -77,7 +79,8 @@ def array_rollout(
 class _ArrayRollout:
     def __init__(
         self,
-        config: SimulatorConfig,
+        kind: ModelKind,
+        effects: Iterable[str],
         numbers: Mapping[str, float | FloatRow],
         commands: FloatRow,
         ticks: int,
@@ -86,27 +89,28 @@ class _ArrayRollout:
         every: int,
     ) -> None:
         self.commands, self.ticks, self.t0_s, self.numbers, self.every = commands, ticks, t0_s, numbers, every
-        self.period_s = config.control_period_s
-        self.key = Key.of(config.kind, config.effects)
-        as_tensors = {n: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for n, v in numbers.items()}
-        delays_s = total_delays_s(as_tensors, config.effects)
+        self.kind, self.effects = kind, tuple(effects)
+        self.period_s = float(numbers["timing.control_period"])
+        self.key = Key.of(kind, self.effects)
+        rows = {name: torch.from_numpy(v) for name, v in numbers.items() if isinstance(v, np.ndarray)}
+        delays_s = total_delays_s({**numbers, **rows}, self.effects)
         self.plan: PeriodPlan = plan_period(self.period_s, delays_s, 0.0, max_step_s)
-        self.model = SingleTrack(ARRAYS, config.kind, numbers, config.effects)
-        self.chain = ActuatorChain(ARRAYS, numbers, config.effects)
 
     def carried_at_start(self, start: FloatRow, past_states: FloatRow | None, before: int) -> FloatRow:
         """Carried rows at the first tick, hidden states simulated through the periods before it from steady state."""
         steering, throttle = self.commands[:, 0]
-        memory = self.chain.settled((steering, throttle))
-        if not self.model.extra_states:
+        chain = ActuatorChain(ARRAYS, self.numbers, self.effects)
+        memory = chain.settled((steering, throttle))
+        if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in self.key.effects):
             if memory and before:
                 inputs = tuple(effect for effect in self.key.effects if isinstance(effect, ActuatorEffect))
                 memory = self._after_history(Key("dynamic", inputs, has_body=False), memory, before, None)
             return self._rows((*start, *memory))
         past_states = np.repeat(start[None], before // self.every, axis=0) if past_states is None else past_states
         bodies = np.concatenate([past_states, start[None]])
-        actuation = self.model.actuation(*self.chain.settled_output((steering, throttle)))
-        extra = self.model.settled(self.t0_s - before * self.period_s, tuple(bodies[0]), actuation)
+        model = SingleTrack(ARRAYS, self.kind, self.numbers, self.effects)
+        actuation = model.actuation(*chain.settled_output((steering, throttle)))
+        extra = model.settled(self.t0_s - before * self.period_s, tuple(bodies[0]), actuation)
         carried = (*bodies[0], *extra, *memory)
         if before:
             carried = (*start, *self._after_history(self.key, carried, before, bodies)[BODY_ROWS:])

@@ -7,7 +7,7 @@ the cars are simulated in chunks that fit the cache. On a GPU, and for second de
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -34,6 +34,7 @@ from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops
+from sim_backends.effects.base import ModelKind
 from sim_backends.measurement import MeasurementModel, filter_step
 
 CARS_AT_ONCE = 4096
@@ -131,7 +132,8 @@ def _on_arrays(
     """States (N, T + 1, 6) of a rollout without a gradient, by compiled code on arrays."""
     earlier = commands.new_zeros(len(start), 1, 2) if past is None else past.commands
     states = array_rollout(
-        config,
+        config.kind,
+        config.effects,
         {**config.values(), **{name: as_array(value) for name, value in given.items()}},
         as_array(start.T.contiguous()),
         as_array(torch.cat([earlier, commands], dim=1).permute(2, 1, 0).contiguous()),
@@ -145,7 +147,8 @@ def _on_arrays(
 
 
 def operator_rollout(
-    config: SimulatorConfig,
+    kind: ModelKind,
+    effects: Iterable[str],
     numbers: Mapping[str, Number],
     start: FloatRow,
     commands: FloatRow,
@@ -159,7 +162,8 @@ def operator_rollout(
 ) -> FloatRow:
     """``array_rollout`` by torch's operators, for ``report_evaluations``; all rows before the first tick are used."""
     given = {name: torch.as_tensor(value, dtype=torch.from_numpy(start).dtype) for name, value in numbers.items()}
-    given.pop("timing.control_period")
+    period_s = float(given.pop("timing.control_period"))
+    config = SimulatorConfig(kind=kind, effects={name: {} for name in effects}, control_period_s=period_s)
     rows = torch.from_numpy(commands).permute(2, 1, 0)
     states = rollout(
         config,
