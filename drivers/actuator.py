@@ -300,10 +300,14 @@ class Actuator:
 
     def _await_connection(self) -> None:
         what = f"The {self.config.device_kind.name} at {self.config.address} is not ready"
-        status = self._await(lambda s: s.t_published_s > 0.0 or s.is_ended, START_TIMEOUT_S)
+        status = self._await(lambda s: s.is_link_open or s.is_ended, START_TIMEOUT_S)
         if status.t_published_s == 0.0:
             raise NotReadyError(
                 what, ("the sender process did not start; run 'python -m drivers.sender.process' by hand to see why.",)
+            )
+        if not status.is_link_open and not status.is_ended:
+            raise NotReadyError(
+                what, (f"it cannot be opened within {START_TIMEOUT_S:g} s; check its adapter, cable and network.",)
             )
         settled = (SenderState.CONNECTED, SenderState.FAULT)
         status = self._await(lambda s: s.is_ended or s.state in settled, self.config.open_timeout_s)

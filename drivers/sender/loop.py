@@ -1,6 +1,7 @@
 """The loop of the sender: it owns the device and sends at absolute deadlines.
 
-It runs in a separate process without other threads (``process``); for a bus within one process it runs in a thread.
+It runs in a separate process (``process``), whose only other thread opens the device; for a bus within one process it
+runs in a thread.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from drivers.calibration import ActuatorCalibration, DeviceCommand
 from drivers.config import ActuatorConfig
 from drivers.device import Device, FirmwareIdentity
 from drivers.sender.logic import NEUTRAL_FRAMES, NEUTRAL_SPAN_S, Order, SenderLogic, SenderState
+from drivers.sender.opening import Opening
 from drivers.sender.slots import Slot
 from drivers.sender.status import SenderStatus
 
@@ -61,6 +63,7 @@ class SenderLoop:
         self._is_realtime = is_realtime
         self._period_s = 1.0 / config.rate_hz
         self._is_link_open = False
+        self._opening: Opening | None = None
         self._is_wake_open = True
         self._is_woken = False
         self._next_poll_s = 0.0
@@ -72,16 +75,18 @@ class SenderLoop:
         self._ticks = 0
         self._deadlines = 0
         self._skipped = 0
-        self._needs_version = False
+        self._needs_version = True
         self._suspended_s = _time_suspended_s()
 
     def run(self) -> None:
         """Connect and send until shutdown; always closes the device and publishes a last status.
 
-        After an unexpected error it sends neutral first.
+        If the device cannot be opened at first, it ends. After an unexpected error it sends neutral first.
         """
         try:
             self._run()
+        except NotReadyError as error:
+            self.logic.link_failed(str(error))
         except Exception as error:
             self._send_last_neutral()
             self.logic.link_failed(
@@ -89,17 +94,11 @@ class SenderLoop:
             )
             raise
         finally:
-            self.device.close()
+            if self._opening is None:
+                self.device.close()
             self._publish(is_ended=True)
 
     def _run(self) -> None:
-        try:
-            self.device.open()
-        except NotReadyError as error:
-            self.logic.link_failed(str(error))
-            return
-        self._is_link_open = True
-        self.logic.link_up()
         deadline_s = time.monotonic()
         while not self.logic.is_finished:
             is_deadline = self._wait(deadline_s)
@@ -164,7 +163,7 @@ class SenderLoop:
             self.logic.resumed()
         self._take_order(now_s)
         self._receive(now_s)
-        self._reconnect(now_s)
+        self._connect(now_s)
         before = self.logic.sent_number
         command, decided_s = self._decide()
         try:
@@ -235,13 +234,23 @@ class SenderLoop:
         self._failed_connects = 0
         self._next_connect_s = time.monotonic() + RECONNECT_PERIODS_S[0]
 
-    def _reconnect(self, now_s: float) -> None:
-        """Try to open a lost link again; the fault stays latched, and only a version request is sent at first."""
+    def _connect(self, now_s: float) -> None:
+        """Open a closed link without waiting for it; after a lost link the fault stays latched.
+
+        Only a version request is sent at first. Raises NotReadyError if the first attempt fails.
+        """
         if self._is_link_open or now_s < self._next_connect_s or self.logic.is_finished:
             return
+        if self._opening is None:
+            self._opening = Opening(self.device)
+        if not self._opening.is_over:
+            return
+        opening, self._opening = self._opening, None
         try:
-            self.device.open()
+            opening.require_success()
         except NotReadyError:
+            if self.logic.state == SenderState.DISCONNECTED:
+                raise
             wait = RECONNECT_PERIODS_S[min(self._failed_connects, len(RECONNECT_PERIODS_S) - 1)]
             self._failed_connects += 1
             self._next_connect_s = now_s + wait
@@ -268,6 +277,7 @@ class SenderLoop:
             state=SenderState.DISCONNECTED if is_ended and not logic.fault else logic.state,
             epoch=logic.epoch,
             is_neutral_settled=logic.is_neutral_settled,
+            is_link_open=self._is_link_open,
             is_sending=logic.is_ready_to_send,
             is_realtime=self._is_realtime,
             is_ended=is_ended,

@@ -27,6 +27,7 @@ class SenderStatus:
     state: SenderState = SenderState.DISCONNECTED
     epoch: int = 0
     is_neutral_settled: bool = False
+    is_link_open: bool = False
     is_sending: bool = False
     is_realtime: bool = False
     is_ended: bool = False

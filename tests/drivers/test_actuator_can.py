@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from dataclasses import replace
@@ -18,6 +19,7 @@ from faulty_frame_link import FaultyFrameLink
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
 from carlab.core.quantities import Action
+from drivers import actuator as actuator_module
 from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
@@ -192,6 +194,20 @@ def test_bus_failure_latches_a_fault_and_the_firmware_times_out() -> None:
                 actuator.arm()
             actuator.reset_fault()
             actuator.arm()
+
+
+def test_bus_that_does_not_open_in_time_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For example an adapter in the network that does not answer."""
+    link, may_open = CanLink("virtual", channel_name()), threading.Event()
+    monkeypatch.setattr(link, "open", may_open.wait)
+    monkeypatch.setattr(actuator_module, "START_TIMEOUT_S", 0.3)
+    device = VescCanDevice(link, 23, 42)
+    actuator = Actuator(config_for("virtual", "bus"), CALIBRATION, lambda c, k: SenderThread(c, k, device))
+    started_s = time.monotonic()
+    with pytest.raises(NotReadyError, match="controller 23 on virtual bus is not ready: it cannot be opened within"):
+        actuator.open()
+    assert time.monotonic() - started_s < 2.0
+    may_open.set()
 
 
 def test_cut_bus_that_returns_after_the_end_of_the_program_gets_neutral_last() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
 import tty
 import uuid
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +18,7 @@ from slcan_adapter import SlcanAdapter
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
 from carlab.core.quantities import Action
-from drivers.actuator import Actuator
+from drivers.actuator import SILENT_SENDER_S, Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from drivers.emulators.can_firmware import CanFirmware
@@ -26,6 +28,7 @@ from drivers.links import slcan_link
 from drivers.links.link import CanFrame
 from drivers.links.slcan_link import SlcanLink, decode_line
 from drivers.sender.logic import SenderState
+from drivers.sender.loop import RECONNECT_PERIODS_S
 from tests.helpers.waiting import until
 
 MOVING = Action(0.5, 0.3)
@@ -78,6 +81,56 @@ def test_removed_adapter_latches_a_fault(adapter: SlcanAdapter, firmware: CanFir
         until(lambda: actuator.status().state == SenderState.FAULT)
         assert "was lost" in actuator.status().fault
         assert not actuator.status().is_ended
+
+
+def test_adapter_that_is_plugged_in_again_gets_neutral(tmp_path: Path, channel: str, firmware: CanFirmware) -> None:
+    """While the adapter starts, the sender answers: it refuses to reset the fault with the reason of the fault."""
+    with (
+        SlcanAdapter(channel, tmp_path / "adapter") as adapter,
+        Actuator(config_for(adapter), ActuatorCalibration()) as actuator,
+    ):
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in firmware.log.motor()))
+        adapter.unplug()
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        adapter.plug()
+        t_plugged_s = time.monotonic()
+        until(lambda: is_open_in_another_process(adapter.port))
+        time.sleep(SILENT_SENDER_S + 0.1)
+        with pytest.raises(ActuatorFaultError, match="was lost"):
+            actuator.reset_fault()
+        until(lambda: len(firmware.log.motor(t_plugged_s)) > 10)
+        commands = firmware.log.motor(t_plugged_s)
+        assert all(e.value == 0.0 for e in commands)
+        assert commands[0].t_s - t_plugged_s < max(RECONNECT_PERIODS_S) + slcan_link.BOOT_S + 1.0
+        actuator.reset_fault()
+        actuator.arm()
+
+
+def test_close_does_not_wait_for_an_adapter_that_starts(tmp_path: Path, channel: str, firmware: CanFirmware) -> None:
+    with SlcanAdapter(channel, tmp_path / "adapter") as adapter:
+        actuator = Actuator(config_for(adapter), ActuatorCalibration())
+        actuator.open()
+        adapter.unplug()
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        adapter.plug()
+        until(lambda: is_open_in_another_process(adapter.port))
+        started_s = time.monotonic()
+        actuator.close()
+        assert time.monotonic() - started_s < 0.5 * slcan_link.BOOT_S
+
+
+def is_open_in_another_process(port: str) -> bool:
+    """Whether another process has the port locked."""
+    descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
 
 
 def test_adapter_that_does_not_read_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,28 +6,45 @@ import os
 import select
 import threading
 import tty
+from pathlib import Path
 from typing import Self
 
 import can
 
 
 class SlcanAdapter:
-    """It forwards frames in both directions and acknowledges each line, like the firmware of such adapters."""
+    """It forwards frames in both directions and acknowledges each line, like the firmware of such adapters.
 
-    def __init__(self, channel: str) -> None:
+    ``link`` is a symbolic link to the port, so that the port has the same name after ``plug``.
+    """
+
+    def __init__(self, channel: str, link: Path | None = None) -> None:
         self.reads = True
         self.lines: list[bytes] = []
-        self._bus = can.Bus(channel, interface="virtual", ignore_config=True)
-        self._master, terminal = os.openpty()
-        tty.setraw(terminal)
-        self.port = os.ttyname(terminal)
-        self._terminal: int | None = terminal
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._channel = channel
+        self._link = link
+        self._terminal: int | None = None
+
+    @property
+    def port(self) -> str:
+        """Path that a host opens."""
+        return self._name if self._link is None else str(self._link)
 
     def send(self, data: bytes) -> None:
         """Send raw bytes to the host."""
         os.write(self._master, data)
+
+    def plug(self) -> None:
+        """Create the port and start the adapter."""
+        self._bus = can.Bus(self._channel, interface="virtual", ignore_config=True)
+        self._master, self._terminal = os.openpty()
+        tty.setraw(self._terminal)
+        self._name = os.ttyname(self._terminal)
+        if self._link is not None:
+            self._link.symlink_to(self._name)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
 
     def unplug(self) -> None:
         """End the adapter and remove its port."""
@@ -38,10 +55,12 @@ class SlcanAdapter:
         os.close(self._master)
         os.close(self._terminal)
         self._terminal = None
+        if self._link is not None:
+            self._link.unlink()
         self._bus.shutdown()
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self.plug()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
