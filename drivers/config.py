@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from carlab.core.errors import ConfigError
 from carlab.core.safety_bounds import SAFETY_BOUNDS, check_bound
 from drivers.calibration import ActuatorCalibration
 from drivers.device_kinds import DEVICE_KINDS, DeviceKind
+from drivers.links.lines import BITS_PER_BYTE, can_frame_bits, slcan_line_bytes, slcan_port
 
 MULTICAST_GROUP = "239.74.163.2"
-BITS_PER_BYTE = 10
-"""Bits of a byte on a serial line: start bit, eight data bits, stop bit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,12 +21,12 @@ class ActuatorConfig:
 
     ``kind`` is vesc_serial or vesc_can (``DEVICE_KINDS``). A serial kind uses ``port`` and ``baud`` (ignored on USB). A
     bus uses ``interface`` (any of python-can: socketcan, slcan, pcan, ..., ``udp_multicast`` between processes,
-    ``virtual`` within one), ``channel`` (the serial port of an slcan adapter), ``bitrate``, the ``controller_id`` and a
-    ``host_id`` that is unique on the bus. The sender sends at ``rate_hz``. It replaces a command older than
-    ``watchdog_s`` by neutral, so ``control_period`` of the car file must be shorter; a command older than ``latch_s``
-    latches a fault. It polls telemetry at ``telemetry_rate_hz``; telemetry older than ``telemetry_stale_s`` gives
-    neutral, older than ``telemetry_lost_s`` latches a fault. ``realtime_priority`` requests SCHED_FIFO; the sender runs
-    without it if the system refuses.
+    ``virtual`` within one), ``channel`` (of an slcan adapter its serial port, PORT or PORT@BAUD), ``bitrate``, the
+    ``controller_id`` and a ``host_id`` that is unique on the bus. The sender sends at ``rate_hz``. It replaces a
+    command older than ``watchdog_s`` by neutral, so ``control_period`` of the car file must be shorter; a command older
+    than ``latch_s`` latches a fault. It polls telemetry at ``telemetry_rate_hz``; telemetry older than
+    ``telemetry_stale_s`` gives neutral, older than ``telemetry_lost_s`` latches a fault. ``realtime_priority`` requests
+    SCHED_FIFO; the sender runs without it if the system refuses.
     """
 
     kind: str = "vesc_serial"
@@ -71,18 +71,49 @@ class ActuatorConfig:
         for name in ("latch_s", "telemetry_lost_s"):
             if not math.isfinite(getattr(self, name)):
                 raise ConfigError(f"{name} in [hardware.actuator] is {getattr(self, name)}; give a finite number.")
-        self._check_baud()
+        self._check_lines()
 
-    def _check_baud(self) -> None:
-        """Raise ConfigError if the serial line is too slow for the rates: old commands would wait in its buffers."""
+    def _check_lines(self) -> None:
+        """Raise ConfigError if a line is too slow for the rates: old commands would wait in its buffers."""
+        name = self.device_kind.name
+        if not self.device_kind.is_bus:
+            self._check_line(
+                f"baud in [hardware.actuator] is {self.baud}",
+                self.baud,
+                max(self._per_s(lambda size: size)) * BITS_PER_BYTE,
+                f"Set a higher baud, also in the {name}, or lower the rates; on USB remove baud, which has no effect "
+                "there.",
+            )
+            return
+        self._check_line(
+            f"bitrate in [hardware.actuator] is {self.bitrate}",
+            self.bitrate,
+            sum(self._per_s(can_frame_bits)),
+            f"Set a higher bitrate, also in the {name}, or lower the rates.",
+        )
+        if self.interface == "slcan":
+            baud = slcan_port(self.channel)[1]
+            self._check_line(
+                f"The baud of the slcan adapter in [hardware.actuator] is {baud}",
+                baud,
+                max(self._per_s(slcan_line_bytes)) * BITS_PER_BYTE,
+                "Set a higher one, also in the adapter, by channel = PORT@BAUD, or lower the rates; on USB it has no "
+                "effect, so set any higher one.",
+            )
+
+    def _per_s(self, size: Callable[[int], int]) -> tuple[float, float]:
+        """Sums of the sizes of the messages that are sent and that are received in a second."""
         kind = self.device_kind
-        sent_bytes_per_s = self.rate_hz * kind.command_bytes + self.telemetry_rate_hz * kind.request_bytes
-        needed = math.ceil(max(sent_bytes_per_s, self.telemetry_rate_hz * kind.reply_bytes) * BITS_PER_BYTE)
-        if not kind.is_bus and self.baud < needed:
+        command, request, reply = (
+            sum(map(size, messages)) for messages in (kind.command_bytes, kind.request_bytes, kind.reply_bytes)
+        )
+        return self.rate_hz * command + self.telemetry_rate_hz * request, self.telemetry_rate_hz * reply
+
+    def _check_line(self, what: str, bits_per_s: int, needed_bits_per_s: float, remedy: str) -> None:
+        if bits_per_s < needed_bits_per_s:
             raise ConfigError(
-                f"baud in [hardware.actuator] is {self.baud}; rate_hz {self.rate_hz:g} and telemetry_rate_hz "
-                f"{self.telemetry_rate_hz:g} need at least {needed}. Set a higher baud, also in the {kind.name}, or "
-                "lower the rates; on USB remove baud, which has no effect there."
+                f"{what}; rate_hz {self.rate_hz:g} and telemetry_rate_hz {self.telemetry_rate_hz:g} need at least "
+                f"{math.ceil(needed_bits_per_s)}. {remedy}"
             )
 
     def check_deadlines(self) -> None:

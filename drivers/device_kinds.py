@@ -16,8 +16,10 @@ class DeviceKind:
 
     ``factory`` is the import path ``module:function`` of a function from an ActuatorConfig to a Device; only the sender
     process imports it. ``name`` appears in messages and, in lower case, in the names of readings. ``silent_hint`` is
-    the remedy if no device answers, ``garbage_hint`` the remedy if the bytes that arrive are no valid frames. The bytes
-    on a serial line are those of one command, one request of telemetry and one reply; 0 if they are unknown.
+    the remedy if no device answers, ``garbage_hint`` the remedy if the bytes that arrive are no valid frames.
+    ``command_bytes``, ``request_bytes`` and ``reply_bytes`` are the sizes of the messages of one command, one request
+    of telemetry and one reply: of each message on a serial line, or of the data of each frame on a bus. They are empty
+    if they are unknown.
     """
 
     factory: str
@@ -25,9 +27,9 @@ class DeviceKind:
     silent_hint: str
     garbage_hint: str = ""
     is_bus: bool = False
-    command_bytes: int = 0
-    request_bytes: int = 0
-    reply_bytes: int = 0
+    command_bytes: tuple[int, ...] = ()
+    request_bytes: tuple[int, ...] = ()
+    reply_bytes: tuple[int, ...] = ()
 
     def load(self) -> Callable[[Any], Device]:
         """Import the factory."""
@@ -41,9 +43,9 @@ DEVICE_KINDS: dict[str, DeviceKind] = {
         name="VESC",
         silent_hint="the port opens but no device answers; switch the VESC on and check that 'port' is the VESC's.",
         garbage_hint="check 'port' and 'baud' in [hardware.actuator].",
-        command_bytes=18,
-        request_bytes=10,
-        reply_bytes=22,
+        command_bytes=(10, 8),
+        request_bytes=(10,),
+        reply_bytes=(22,),
     ),
     "vesc_can": DeviceKind(
         factory="drivers.vesc.can_device:make_device",
@@ -51,6 +53,9 @@ DEVICE_KINDS: dict[str, DeviceKind] = {
         silent_hint="no device answers; check power, termination, the bitrate, and that controller_id in "
         "[hardware.actuator] is the VESC's id and its CAN mode is VESC.",
         is_bus=True,
+        command_bytes=(4, 5),
+        request_bytes=(7,),
+        reply_bytes=(8, 8, 4, 6),
     ),
 }
 """Device kinds by their name in car files; add a protocol here."""

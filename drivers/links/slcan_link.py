@@ -12,11 +12,10 @@ import time
 from typing import Final
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
+from drivers.links.lines import slcan_port
 from drivers.links.link import CanFrame
 from drivers.links.serial_link import SerialLink
 
-BAUD: Final = 115200
-"""Default speed of the serial line; an adapter on USB ignores it."""
 BOOT_S: Final = 2.0
 """Time for which an adapter may start after its port was opened: opening resets an Arduino [s]."""
 BITRATE_COMMANDS: Final = {
@@ -32,16 +31,15 @@ _TIME_STAMP_DIGITS = 4
 
 
 class SlcanLink:
-    """Frame link to an slcan adapter; ``channel`` is its serial port, or PORT@BAUD.
+    """Frame link to an slcan adapter; ``channel`` is its serial port, PORT or PORT@BAUD.
 
     The port is opened exclusively. Lines that are no data frame with a 29-bit identifier are ignored.
     """
 
     def __init__(self, channel: str, bitrate: int = 500_000) -> None:
-        port, _, baud = channel.partition("@")
         self.channel = channel
         self.bitrate = bitrate
-        self._serial = SerialLink(port, int(baud) if baud.isdecimal() else BAUD, setting="channel")
+        self._serial = SerialLink(*slcan_port(channel), setting="channel")
         self.statistics = self._serial.statistics
         self._received = b""
 
