@@ -17,6 +17,7 @@ from drivers.config import ActuatorConfig
 from drivers.sender.logic import Order, Request, SenderState
 from drivers.sender.process import Sender, start_sender
 from drivers.sender.status import SenderStatus
+from drivers.sender.timeout_measurement import MAX_TIMEOUT_S
 
 START_TIMEOUT_S = 15.0
 ANSWER_TIMEOUT_S = 2.0
@@ -99,6 +100,21 @@ class Actuator:
         """
         self._await(lambda s: time.monotonic() - s.t_telemetry_s <= self.config.telemetry_stale_s, timeout_s)
 
+    def measure_motor_timeout(self) -> None:
+        """Send no command until the firmware releases the motor; ``health`` and ``problems`` have the result.
+
+        The motor is in neutral meanwhile. Has no effect unless the actuator is connected, disarmed and settled in
+        neutral, and the firmware reports the release. Raises NotOpenError, ActuatorFaultError.
+        """
+        self.require_no_fault()
+        self._await(lambda s: s.is_neutral_settled, ANSWER_TIMEOUT_S)
+        epoch = self._post_request(Request.MEASURE_TIMEOUT)
+        status = self._await_epoch(epoch)
+        if not status.refusal:
+            limit_s = MAX_TIMEOUT_S + ANSWER_TIMEOUT_S
+            self._await(lambda s: s.epoch > epoch or not math.isnan(s.motor_timeout_s), limit_s)
+            self._await(lambda s: not s.is_motor_released, ANSWER_TIMEOUT_S)
+
     def command(self, action: Action) -> Action:
         """Post the newest command and return the command on the wire, clamped and rounded by the calibration.
 
@@ -179,6 +195,12 @@ class Actuator:
         age_s = time.monotonic() - status.t_telemetry_s
         if not age_s <= self.config.telemetry_stale_s and not found:
             found.append(f"the {self.config.device_kind.name}'s telemetry is {age_s:.1f} s old; check the link.")
+        if status.motor_timeout_s == math.inf:
+            kind = self.config.device_kind
+            found.append(
+                f"the {kind.name} does not stop the motor within {MAX_TIMEOUT_S:g} s after the last command; "
+                f"{kind.timeout_hint}"
+            )
         return tuple(found)
 
     def health(self) -> Health:
@@ -194,6 +216,7 @@ class Actuator:
             "tachometer_steps": status.tachometer_steps,
             f"{device}_fault_code": float(status.fault_code),
             f"{device}_motor_timeout_flag": float(status.is_motor_released),
+            f"{device}_time_to_motor_release_s": status.motor_timeout_s,
             "firmware_version": status.firmware_major + status.firmware_minor / 100.0,
             "telemetry_age_s": time.monotonic() - status.t_telemetry_s,
             "command_to_wire_s": status.t_written_s - status.t_issued_s,

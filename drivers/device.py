@@ -43,8 +43,8 @@ class Telemetry(Protocol):
         """Fault code of the firmware; 0 for no fault. Telemetry without it does not count as fresh."""
 
     @property
-    def motor_timeout_active(self) -> bool:
-        """Whether the firmware has released the motor because it received no command in time."""
+    def motor_timeout_active(self) -> bool | None:
+        """Whether the firmware has released the motor because it received no command in time; None if unknown."""
 
     def fault(self) -> str:
         """Reason why the firmware forbids driving, with the remedy; empty if there is none."""

@@ -166,6 +166,14 @@ class HardwareCar(Car):
         readings = {**actuator.readings, **{f"mocap_{k}": v for k, v in self.pose_source.statistics().items()}}
         return Health(not problems, problems, readings)
 
+    def measure_motor_timeout(self) -> None:
+        """Measure the time-out of the motor controller, without motion; ``health`` has the result.
+
+        Raises NotOpenError, ActuatorFaultError.
+        """
+        self._require_open()
+        self.actuator.measure_motor_timeout()
+
     @property
     def watchdog_trips(self) -> int:
         """Trips of the sender's watchdog since ``open``; 0 when closed."""

@@ -62,6 +62,8 @@ def check(
 ) -> CarCheck:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
+    On a car with a motor controller no command is sent for a while, to measure the controller's time-out.
+
     Args:
         car: as for ``carlab.drive``.
         task: a task to check first, before anything is opened: as for ``carlab.drive``; None: none.
@@ -83,6 +85,7 @@ def check(
     from carlab.cars import choose_car
     from carlab.cars.emulated_car import EmulatedCar
     from carlab.cars.latency import measure_latency, measure_pose_latency
+    from drivers.hardware_car import HardwareCar
 
     above_zero(seconds=seconds)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=0)
@@ -96,6 +99,9 @@ def check(
             latency = measure_pose_latency(opened, seconds=seconds, period_s=choice.control_period_s)
             if wheels and isinstance(opened, EmulatedCar):
                 latency = measure_latency(opened, period_s=choice.control_period_s)
+            hardware = opened.hardware if isinstance(opened, EmulatedCar) else opened
+            if isinstance(hardware, HardwareCar):
+                hardware.measure_motor_timeout()
         except (NotReadyError, TimeoutError) as error:
             problems.append(str(error))
         health = opened.health()

@@ -17,6 +17,8 @@ from carlab.core.errors import NotReadyError
 class Check:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
+    On a car with a motor controller no command is sent for a while, to measure the controller's time-out.
+
     With --task, first find errors of shape and unit in a task.
 
     Exit code 0 if the car is ready to be armed, 3 if not; all reasons are listed.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.device import FirmwareIdentity, Telemetry
+from drivers.sender.timeout_measurement import TimeoutMeasurement
 
 NEUTRAL_FRAMES = 3
 NEUTRAL_SPAN_S = 0.12
@@ -34,6 +35,7 @@ class Request(enum.IntEnum):
     STOP_AND_LATCH = 3
     RESET_FAULT = 4
     SHUT_DOWN = 5
+    MEASURE_TIMEOUT = 6
 
 
 _ORDER = struct.Struct("<QBQdBii")
@@ -90,6 +92,7 @@ class SenderLogic:
         self.values: Telemetry | None = None
         self.t_values_s: float | None = None
         self.is_finished = False
+        self.timeout = TimeoutMeasurement()
         self.watchdog_trips = 0
         self.frames = 0
         self.neutral_frames = 0
@@ -99,6 +102,7 @@ class SenderLogic:
         self._order: Order | None = None
         self._decided: Order | None = None
         self._is_watchdog_tripped = False
+        self._t_written_s = 0.0
         self._t_first_neutral_s: float | None = None
         self._neutral_run = 0
         self._is_neutral_settled = False
@@ -146,6 +150,8 @@ class SenderLogic:
             self.t_values_s = t_s
             if self.state == SenderState.DISCONNECTED and self.is_ready_to_send:
                 self.state = SenderState.CONNECTED
+        if values.motor_timeout_active is not None:
+            self.timeout.note(t_s, values.motor_timeout_active)
         if (cause := self._firmware_cause()) and self.state != SenderState.DISCONNECTED:
             self._latch(cause)
 
@@ -169,6 +175,7 @@ class SenderLogic:
         if order.epoch > self.epoch:
             self.epoch = order.epoch
             self._order = None
+            self.timeout.cancel()
             self._handle_request(now_s, order)
         if order.request == Request.ARM and order.number > 0:
             self._order = order
@@ -181,11 +188,13 @@ class SenderLogic:
             if self._is_shutting_down:
                 self.is_finished = True
             return None
-        return self._command(now_s)
+        self.timeout.advance(now_s)
+        return None if self.timeout.is_running else self._command(now_s)
 
     def written(self, now_s: float, command: DeviceCommand) -> None:
         """Count a written command; a decision that was replaced before the write does not count."""
         self.frames += 1
+        self._t_written_s = now_s
         order = self._decided
         if order is not None and command is order.command:
             self.sent_number, self.t_sent_issued_s = order.number, order.t_issued_s
@@ -231,6 +240,10 @@ class SenderLogic:
             self._reset_fault(now_s)
         elif order.request == Request.SHUT_DOWN:
             self._shut_down()
+        elif order.request == Request.MEASURE_TIMEOUT:
+            self.refusal = self._measurement_refusal()
+            if not self.refusal:
+                self.timeout.start(self._t_written_s)
 
     def _arming_refusal(self, now_s: float) -> str:
         if self.state == SenderState.FAULT:
@@ -239,6 +252,13 @@ class SenderLogic:
             return f"the sender is {self.state.name.lower()}; wait until it is connected."
         if self.telemetry_age_s(now_s) > self.config.telemetry_stale_s:
             return f"the {self.config.device_kind.name}'s telemetry is stale; check the link."
+        return ""
+
+    def _measurement_refusal(self) -> str:
+        if self.state != SenderState.CONNECTED or not self._is_neutral_settled:
+            return self.fault or "the time-out is measured in neutral only; stop the car."
+        if self.values is None or self.values.motor_timeout_active is None:
+            return "the firmware does not report its time-out."
         return ""
 
     def _reset_fault(self, now_s: float) -> None:
@@ -259,6 +279,7 @@ class SenderLogic:
         if not self._is_shutting_down:
             self._is_shutting_down = True
             self._order = None
+            self.timeout.cancel()
             self._begin_neutral(SenderState.STOPPING if self.state != SenderState.FAULT else SenderState.FAULT)
 
     def _begin_neutral(self, state: SenderState) -> None:
@@ -304,3 +325,4 @@ class SenderLogic:
             self.fault = text
         self.state = SenderState.FAULT
         self._order = None
+        self.timeout.cancel()

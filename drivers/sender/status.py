@@ -19,8 +19,9 @@ class SenderStatus:
 
     ``epoch`` is that of the last request handled; ``refusal`` is the reason if it was refused. ``sent_number``,
     ``t_issued_s`` and ``t_written_s`` (start of the write) belong to the newest command written. ``is_sending`` is
-    False while the link is closed or the firmware unknown. ``is_motor_released``: the firmware's time-out has
-    released the motor. ``late_*`` is the lateness of the sender's deadlines.
+    False while the link is closed or the firmware unknown. ``is_motor_released``: the firmware's time-out has released
+    the motor. ``motor_timeout_s``: the measured time-out, infinite if there is none. ``late_*`` is the lateness of the
+    sender's deadlines.
     """
 
     t_published_s: float = 0.0
@@ -39,6 +40,7 @@ class SenderStatus:
     tachometer_steps: float = float("nan")
     fault_code: int = 0
     is_motor_released: bool = False
+    motor_timeout_s: float = float("nan")
     sent_number: int = 0
     t_issued_s: float = float("nan")
     t_written_s: float = float("nan")

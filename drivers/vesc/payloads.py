@@ -144,9 +144,9 @@ class MotorValues:
     status_bits: int | None = None
 
     @property
-    def motor_timeout_active(self) -> bool:
-        """Whether the firmware reports that its time-out has released the motor (firmware 6.00 and later)."""
-        return bool((self.status_bits or 0) & 1)
+    def motor_timeout_active(self) -> bool | None:
+        """Whether the firmware's time-out has released the motor; None if it does not report it (before 6.00)."""
+        return None if self.status_bits is None else bool(self.status_bits & 1)
 
     @property
     def kill_switch_active(self) -> bool:

@@ -27,7 +27,7 @@ class ToyTelemetry:
     input_v: float | None = None
     fault_code: int | None = None
     tachometer_steps: float | None = None
-    motor_timeout_active: bool = False
+    motor_timeout_active: bool | None = None
 
     def fault(self) -> str:
         return "the toy is too hot; let it cool, then reset the fault." if self.fault_code else ""
