@@ -75,6 +75,10 @@ class DryRunCar(Car):
         """Health of the wrapped car."""
         return self.car.health()
 
+    def pose_problems(self) -> tuple[str, ...]:
+        """Suspected errors of the wrapped car's motion capture."""
+        return self.car.pose_problems()
+
     def place(self, state: CarState) -> bool:
         """Place the wrapped car."""
         return self.car.place(state)

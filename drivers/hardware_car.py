@@ -124,7 +124,7 @@ class HardwareCar(Car):
         self.actuator.require_no_fault()
         self.actuator.await_telemetry(ARM_WAIT_S)
         self._await_poses()
-        reasons = [*self.actuator.problems(), *self._pose_problems()]
+        reasons = [*self.actuator.problems(), *self._pose_reasons()]
         estimate = self.estimator.estimate()
         if estimate is not None and not self.estimator.velocity_valid:
             reasons.append("too few poses arrived to estimate the speed; try again.")
@@ -162,7 +162,7 @@ class HardwareCar(Car):
         if not self._is_open:
             return Health(False, (f"{self.name} is not open; call open() first.",))
         actuator = self.actuator.health()
-        problems = (*actuator.problems, *self._pose_problems())
+        problems = (*actuator.problems, *self._pose_reasons())
         readings = {**actuator.readings, **{f"mocap_{k}": v for k, v in self.pose_source.statistics().items()}}
         return Health(not problems, problems, readings)
 
@@ -178,6 +178,10 @@ class HardwareCar(Car):
     def watchdog_trips(self) -> int:
         """Trips of the sender's watchdog since ``open``; 0 when closed."""
         return self.actuator.status().watchdog_trips if self._is_open else 0
+
+    def pose_problems(self) -> tuple[str, ...]:
+        """Suspected errors of motion capture while poses arrive; empty if there are none."""
+        return tuple(self.pose_source.problems())
 
     def place(self, state: CarState) -> bool:
         """Move an emulated car to ``state`` and wait for a pose captured afterwards (a second at most).
@@ -213,7 +217,7 @@ class HardwareCar(Car):
         """Read poses until the speed can be estimated, ``ARM_WAIT_S`` at most."""
         until_s = self.clock.now_s() + ARM_WAIT_S
         self._take_poses()
-        while self._pose_problems() or not self.estimator.velocity_valid:
+        while self._pose_reasons() or not self.estimator.velocity_valid:
             left_s = until_s - self.clock.now_s()
             if left_s <= 0.0 or self.pose_source.wait_for(self._sequence, left_s) is None:
                 break
@@ -231,9 +235,9 @@ class HardwareCar(Car):
             self._sequence = sample.sequence
             self._newest = sample
 
-    def _pose_problems(self) -> list[str]:
+    def _pose_reasons(self) -> list[str]:
         """Reasons not to arm: no fresh tracked pose, and the problems that the pose source reports."""
-        return [*self._missing_pose(), *self.pose_source.problems()]
+        return [*self._missing_pose(), *self.pose_problems()]
 
     def _missing_pose(self) -> list[str]:
         newest = self.pose_source.latest()

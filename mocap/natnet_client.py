@@ -40,7 +40,7 @@ from mocap.natnet.sockets import (
     resolve,
     udp_socket,
 )
-from mocap.stream_statistics import StreamStatistics
+from mocap.stream_statistics import MALFORMED_RUN, StreamStatistics
 from mocap.time_alignment import ClockAlignment
 
 _log = logging.getLogger(__name__)
@@ -183,6 +183,11 @@ class NatNetClient:
         if self.server_mode == ServerMode.RECORDING_OR_EDIT:
             return self._is_recording
         return self.server_mode in (None, ServerMode.LIVE)
+
+    @property
+    def is_unreadable(self) -> bool:
+        """Whether the newest datagrams could not be decoded, for example after a change of the bitstream version."""
+        return self._statistics.malformed_run >= MALFORMED_RUN
 
     @property
     def version(self) -> BitstreamVersion | None:

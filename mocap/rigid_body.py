@@ -34,8 +34,9 @@ RECENT_SHARE = 0.2
 class RigidBodyPoseSource:
     """Poses of one rigid body, received in a separate thread.
 
-    A frame in which the body is untracked, is missing, or has an invalid pose gives a sample with ``tracked=False``
-    and the last valid pose; before the first valid pose it gives the untracked pose, or no sample if there is none.
+    A frame in which the body is untracked, is missing, or has an invalid pose, and a frame of a recorded take, gives a
+    sample with ``tracked=False`` and the last valid pose; before the first valid pose it gives the untracked pose, or
+    no sample if there is none.
     ``t_capture_s`` is the time of exposure on the host's clock (see ``mocap.time_alignment``); for a server without
     clock stamps it is the time of arrival.
     """
@@ -150,6 +151,8 @@ class RigidBodyPoseSource:
                     f"the poses arrive more than {MAX_LATENCY_MS:g} ms after their exposure, too late to control a "
                     "car; check the network and the load of Motive's computer."
                 )
+        if self._client.is_unreadable:
+            found.append(f"no frame can be read: {self._client.last_error}")
         if not self._client.is_live:
             found.append("Motive is in Edit mode and streams a recorded take; switch it to Live mode.")
         info = self._client.server_info
@@ -226,7 +229,7 @@ class RigidBodyPoseSource:
             self._recent_unusable.append(pose is None)
         if body is None:
             self._missing += 1
-        elif not body.is_tracked:
+        elif not body.is_tracked or not self._client.is_live:
             self._untracked += 1
         elif pose is None:
             self._unusable += 1

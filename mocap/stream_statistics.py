@@ -10,6 +10,8 @@ REORDER_WINDOW = 100
 """A frame number this far back means that the server has restarted its count."""
 RESTART_RUN = 10
 """So does this number of consecutive late frames with increasing numbers."""
+MALFORMED_RUN = 10
+"""Number of consecutive datagrams that cannot be decoded after which the stream counts as unreadable."""
 
 
 class StreamStatistics:
@@ -21,6 +23,7 @@ class StreamStatistics:
         self.out_of_order = 0
         self.repeated = 0
         self.malformed = 0
+        self.malformed_run = 0
         self.foreign = 0
         self.mistimed = 0
         self.restarts = 0
@@ -40,6 +43,7 @@ class StreamStatistics:
         Sequence numbers are the server's frame numbers with an offset after a restart of the server, so that they
         keep increasing.
         """
+        self.malformed_run = 0
         if self._newest is None:
             self._newest = frame_number - 1
         step = frame_number - self._newest
@@ -83,6 +87,7 @@ class StreamStatistics:
     def add_malformed(self, text: str) -> None:
         """Count a datagram that could not be decoded."""
         self.malformed += 1
+        self.malformed_run += 1
         self.last_error = text
 
     def rate_hz(self) -> float:

@@ -236,6 +236,10 @@ class EmulatedCar(Car):
         """Trips of the driver's watchdog since ``open``; 0 when closed."""
         return 0 if self._car is None else self._car.watchdog_trips
 
+    def pose_problems(self) -> tuple[str, ...]:
+        """Suspected errors of the driver's motion capture; empty when closed."""
+        return () if self._car is None else self._car.pose_problems()
+
     def place(self, state: CarState) -> bool:
         """Put the car at ``state`` and wait until no pose of the old place is in a velocity window."""
         placed = self.hardware.place(state)

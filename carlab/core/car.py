@@ -63,6 +63,10 @@ class Car(ABC):
         """Number of times since ``open`` that a command became too old and neutral replaced it; 0 if unknown."""
         return 0
 
+    def pose_problems(self) -> tuple[str, ...]:
+        """Suspected errors of motion capture while poses arrive, with their remedies; empty if there are none."""
+        return ()
+
     def place(self, state: CarState) -> bool:
         """Put the car at ``state`` without driving; returns False if a person has to do it."""
         return False

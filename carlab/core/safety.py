@@ -28,6 +28,8 @@ FROZEN_POSITION_M, FROZEN_YAW_RAD = 2e-5, 1e-4
 of a car that is blocked with turning wheels still changes by the noise, so it does not count as frozen."""
 CLOCK_TOLERANCE_S = 0.01
 """Largest time of arrival ahead of the car's clock [s]; a later one belongs to another clock."""
+POSE_REASONS = (EndReason.POSE_STALE, EndReason.POSE_JUMP, EndReason.POSE_FROZEN, EndReason.TRACKING_LOST)
+"""Ends of an episode that an error of motion capture may explain."""
 UPPER_BOUNDS: Mapping[str, Bound] = {
     "max_speed_mps": SAFETY_BOUNDS.speed,
     "max_yaw_rate_radps": SAFETY_BOUNDS.yaw_rate,
@@ -344,5 +346,7 @@ class SafeCar:
 
     def _end(self, reason: EndReason, detail: str, now_s: float) -> NoReturn:
         self.stop(planned=False)
+        if reason in POSE_REASONS and (problems := self.car.pose_problems()):
+            detail = f"{detail} Motion capture reports: {' '.join(problems)}"
         self._on_event(SafetyEvent(now_s, reason.name.lower(), f"{reason.value} {detail}"))
         raise SafetyStop(reason, detail)

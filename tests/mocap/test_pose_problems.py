@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
+from carlab.core.quantities import PoseSample
 from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
-from mocap.natnet.models import MessageId, ServerMode
+from mocap.natnet.models import BitstreamVersion, MessageId, ServerMode
 from mocap.natnet_client import NatNetClient
 from mocap.rigid_body import RigidBodyPoseSource
 
@@ -35,6 +36,27 @@ def test_recorded_take_is_a_problem(serve: Serve, configure: Configure, until: U
         server.faults = ServerFaults(server_mode=server_mode)
         until(lambda: source.client.server_mode == server_mode)
         assert source.problems() == ("Motive is in Edit mode and streams a recorded take; switch it to Live mode.",)
+        until(lambda: not newest(source).tracked)
+        server.faults = ServerFaults()
+        until(lambda: source.problems() == ())
+        until(lambda: newest(source).tracked)
+
+
+def newest(source: RigidBodyPoseSource) -> PoseSample:
+    sample = source.latest()
+    assert sample is not None
+    return sample
+
+
+def test_frames_that_have_become_unreadable_are_a_problem(serve: Serve, configure: Configure, until: Until) -> None:
+    server = serve()
+    with RigidBodyPoseSource(configure(server)) as source:
+        assert source.problems() == ()
+        server.faults = ServerFaults(frame_version=BitstreamVersion(3, 0))
+        until(lambda: bool(source.problems()))
+        (text,) = source.problems()
+        assert text.startswith("no frame can be read: ")
+        assert "3.0" in text
         server.faults = ServerFaults()
         until(lambda: source.problems() == ())
 
