@@ -22,6 +22,10 @@ MAX_SAMPLES = 1024
 NORM_TOLERANCE = 0.01
 TILT_LIMIT_RAD = math.radians(40.0)
 HEIGHT_LIMIT_M = 0.3
+MAX_MARKER_OFFSET_M = 3.0
+"""Largest coordinate of a marker in the body's frame [m]: a larger body is no model car."""
+MAX_POSITION_M = 500.0
+"""Largest coordinate of a body [m]: no capture volume is larger."""
 MAX_LATENCY_MS = 100.0
 """Largest median time from exposure to arrival [ms]: at 5 m/s a car drives half a metre in it."""
 RECENT_FRAMES = 60
@@ -138,6 +142,7 @@ class RigidBodyPoseSource:
         if self._client.failure is not None:
             found.append(f"motion capture stopped, {self._client.last_error}; close it and open it again.")
         with self._new_sample:
+            found += self._unit_problems()
             found += self._axis_problems()
             if self._body is None and self._is_open:
                 found.append("the server no longer has the body; define it again in Motive under the same name.")
@@ -160,6 +165,19 @@ class RigidBodyPoseSource:
         if self._is_open and has_clock and not self._client.alignment.is_aligned:
             found.append("the server answers no clock echo, so capture times are times of arrival; check the firewall.")
         return tuple(found)
+
+    def _unit_problems(self) -> list[str]:
+        """Signs of a server that streams millimetres: a body larger than a model car, or one that is far away."""
+        markers = () if self._body is None else self._body.marker_positions_m
+        size_m = max((abs(value) for marker in markers for value in marker), default=0.0)
+        newest = self._samples[-1] if self._samples else None
+        distance_m = 0.0 if newest is None else max(abs(newest.x_m), abs(newest.y_m))
+        if size_m <= MAX_MARKER_OFFSET_M and distance_m <= MAX_POSITION_M:
+            return []
+        return [
+            f"the body '{self._body_name}' is larger than {MAX_MARKER_OFFSET_M:g} m, or its position is beyond "
+            f"{MAX_POSITION_M:g} m: the server does not seem to stream metres; set its unit of length to metres."
+        ]
 
     def _axis_problems(self) -> list[str]:
         """Signs of a wrong vertical axis: a tilted body, or one that moves in a vertical plane.

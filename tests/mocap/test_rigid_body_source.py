@@ -114,6 +114,19 @@ def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Un
         assert 'up_axis = "y"' in source.problems()[0]
 
 
+@pytest.mark.parametrize(
+    ("markers_m", "position_m"),
+    [(((120.0, 0.0, 30.0), (-100.0, 50.0, 20.0)), (0.0, 0.0, 30.0)), ((), (1200.0, -800.0, 30.0))],
+)
+def test_millimetres_are_reported(
+    serve: Serve, configure: Configure, markers_m: Any, position_m: tuple[float, float, float]
+) -> None:
+    server = serve(lambda t_s: [RigidBodySample(t_s, position_m)], bodies=(EmulatedBody("car", 1, markers_m),))
+    with RigidBodyPoseSource(configure(server)) as source:
+        (text,) = source.problems()
+        assert "the server does not seem to stream metres; set its unit of length to metres." in text
+
+
 def test_carried_car_is_no_problem_once_it_stands_level(serve: Serve, configure: Configure, until: Until) -> None:
     tilts_deg, height_m, y_m = [60.0], [0.0], [0.0]
 
