@@ -1,8 +1,9 @@
-"""An exclusive lock on one motor controller of a bus, so that two programs cannot command it.
+"""An exclusive lock on one id of a bus: two programs cannot command one motor controller, or receive one's replies.
 
 A CAN bus accepts any number of senders. Two programs that send to one motor controller alternate between the commands
-of both, and neither can see it. The lock is a Unix socket with an abstract name (unix(7)): it excludes programs of all
-users of the computer, needs no file, and the kernel releases it when its process ends for any reason.
+of both, and neither can see it. The frames of replies to one host id mix. The lock is a Unix socket with an abstract
+name (unix(7)): it excludes programs of all users of the computer, needs no file, and the kernel releases it when its
+process ends for any reason.
 """
 
 from __future__ import annotations
@@ -21,17 +22,20 @@ MAX_QUESTIONS = 4096
 
 
 class BusLock:
-    """Lock on ``controller_id`` at the bus ``interface`` ``channel``. Constructing does nothing.
+    """Lock on a controller, or on this program's ``host`` id, at the bus ``interface`` ``channel``.
+
+    Constructing does nothing.
 
     Two objects exclude each other, in one process too. A ``virtual`` bus exists within one process, and so does its
     lock.
     """
 
-    def __init__(self, interface: str, channel: str, controller_id: int) -> None:
-        self.what = f"Controller {controller_id} on CAN bus {interface} {channel}"
+    def __init__(self, interface: str, channel: str, can_id: int, *, is_host: bool = False) -> None:
+        self.what = f"{'Host id' if is_host else 'Controller'} {can_id} on CAN bus {interface} {channel}"
+        self._is_host = is_host
         bus = os.path.realpath(channel) if channel.startswith("/") else channel
         process = os.getpid() if interface == "virtual" else 0
-        key = hashlib.sha256(f"{interface}\0{bus}\0{controller_id}\0{process}".encode()).hexdigest()[:24]
+        key = hashlib.sha256(f"{interface}\0{bus}\0{can_id}\0{process}".encode()).hexdigest()[:24]
         self._address = f"\0carlab-bus-{key}"
         self._socket: socket.socket | None = None
 
@@ -47,6 +51,8 @@ class BusLock:
             own.close()
             if error.errno == errno.EADDRINUSE:
                 remedy = f"another program drives it ({self._holder()}); end that program first."
+                if self._is_host:
+                    remedy = f"another program uses it ({self._holder()}); set another host_id in [hardware.actuator]."
                 raise NotReadyError(f"{self.what} is in use", (remedy,)) from error
             remedy = f"the system does not allow its lock, a Unix socket ({error.strerror}); allow it."
             raise NotReadyError(f"{self.what} cannot be locked", (remedy,)) from error

@@ -56,26 +56,40 @@ class CanLink:
     queue still has room for neutral behind the few moving commands. An interface of python-can raises the errors of its
     own library too; each of them is a failure of the bus.
 
-    With a ``controller_id``, the open link holds the lock on this controller (``drivers.links.bus_lock``).
+    With a ``controller_id`` and a ``host_id``, the open link holds the locks on them (``drivers.links.bus_lock``).
     """
 
-    def __init__(self, interface: str, channel: str, bitrate: int = 500_000, controller_id: int | None = None) -> None:
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        bitrate: int = 500_000,
+        controller_id: int | None = None,
+        host_id: int | None = None,
+    ) -> None:
         self.interface = interface
         self.channel = channel
         self.bitrate = bitrate
         self.statistics = LinkStatistics()
         self._bus: can.BusABC | None = None
         self._descriptor: int | None = None
-        self._lock = None if controller_id is None else BusLock(interface, channel, controller_id)
+        self._locks = [
+            BusLock(interface, channel, can_id, is_host=can_id == host_id)
+            for can_id in (controller_id, host_id)
+            if can_id is not None
+        ]
 
     def open(self) -> None:
-        """Lock the controller and open the bus. Raises NotReadyError with the remedy."""
+        """Lock the ids and open the bus. Raises NotReadyError with the remedy."""
         if self._bus is not None:
             return
-        if self._lock is not None:
-            self._lock.acquire()
         try:
+            for lock in self._locks:
+                lock.acquire()
             self._bus = self._open_bus()
+        except NotReadyError:
+            self._unlock()
+            raise
         except Exception as error:
             self._unlock()
             raise NotReadyError(
@@ -126,7 +140,7 @@ class CanLink:
         return self._descriptor
 
     def close(self) -> None:
-        """Shut the bus down, drop unsent frames, and release the controller."""
+        """Shut the bus down, drop unsent frames, and release the ids."""
         bus, self._bus, self._descriptor = self._bus, None, None
         try:
             if bus is not None:
@@ -136,8 +150,8 @@ class CanLink:
             self._unlock()
 
     def _unlock(self) -> None:
-        if self._lock is not None:
-            self._lock.release()
+        for lock in self._locks:
+            lock.release()
 
     def _open_bus(self) -> can.BusABC:
         return open_bus(self.interface, self.channel, self.bitrate)

@@ -102,6 +102,6 @@ def make_device(config: ActuatorConfig) -> VescCanDevice:
     if config.interface == "slcan":
         link = SlcanLink(config.channel, config.bitrate)
     else:
-        link = CanLink(config.interface, config.channel, config.bitrate, config.controller_id)
+        link = CanLink(config.interface, config.channel, config.bitrate, config.controller_id, config.host_id)
     has_echo = config.interface == "udp_multicast"
     return VescCanDevice(link, config.controller_id, config.host_id, has_echo=has_echo)

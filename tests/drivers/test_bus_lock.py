@@ -112,6 +112,25 @@ def test_two_links_exclude_each_other_until_one_is_closed() -> None:
     second.close()
 
 
+def test_two_cars_on_one_bus_need_different_host_ids() -> None:
+    """The frames of the replies of both controllers to one host id would mix."""
+    channel = f"test-{uuid.uuid4()}"
+    first = CanLink("virtual", channel, controller_id=23, host_id=42)
+    second = CanLink("virtual", channel, controller_id=24, host_id=42)
+    other = CanLink("virtual", channel, controller_id=24, host_id=43)
+    first.open()
+    for _ in range(2):
+        with pytest.raises(NotReadyError, match=r"Host id 42 on CAN bus .* in use: .*; set another host_id in"):
+            second.open()
+    other.open()
+    other.close()
+    with pytest.raises(NotReadyError, match=r"Host id 23 on CAN bus"):
+        CanLink("virtual", channel, controller_id=24, host_id=23).open()
+    first.close()
+    second.open()
+    second.close()
+
+
 @pytest.mark.parametrize(("interface", "channel"), [("no_such_interface", "x"), ("udp_multicast", "239.1.1.1:99999")])
 def test_failed_opening_releases_the_controller(interface: str, channel: str) -> None:
     link = CanLink(interface, channel, controller_id=23)
