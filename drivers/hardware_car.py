@@ -96,9 +96,8 @@ class HardwareCar(Car):
         estimate = self.estimator.estimate()
         newest, seen = self._newest, self.estimator.newest
         if estimate is None or newest is None or seen is None:
-            raise PoseLostError(
-                "Motion capture has not seen the body yet; check that its markers are visible and its id is right."
-            )
+            remedy = " ".join(self.pose_problems()) or "check that its markers are visible and its id is right."
+            raise PoseLostError(f"Motion capture has not seen the body yet; {remedy}")
         state, delay_s = estimate
         poses = tuple(self._new_poses)
         self._new_poses.clear()
@@ -237,18 +236,20 @@ class HardwareCar(Car):
 
     def _pose_reasons(self) -> list[str]:
         """Reasons not to arm: no fresh tracked pose, and the problems that the pose source reports."""
-        return [*self._missing_pose(), *self.pose_problems()]
-
-    def _missing_pose(self) -> list[str]:
+        problems = list(self.pose_problems())
         newest = self.pose_source.latest()
         if newest is None:
-            return ["motion capture has sent no pose yet; check its software, the network and the body's id."]
+            return [
+                "motion capture has sent no pose yet; check its software, the network and the body's id.",
+                *problems,
+            ]
         age_s = self.clock.now_s() - newest.t_receive_s
         if age_s > self.config.arm_max_pose_age_s:
-            return [f"the newest pose is {age_s:.1f} s old; check the motion-capture software and the network."]
-        if not newest.tracked:
+            stale = f"the newest pose is {age_s:.1f} s old; check the motion-capture software and the network."
+            return [stale, *problems]
+        if not newest.tracked and not problems:
             return ["motion capture does not see the body; check its markers and the capture volume."]
-        return []
+        return problems
 
     def _require_open(self) -> None:
         if not self._is_open:

@@ -10,6 +10,7 @@ import pytest
 from carlab.cars.car_file import default_car
 from carlab.cars.emulated_car import EmulatedCar
 from carlab.core.clock import Pacer
+from carlab.core.errors import NotReadyError, PoseLostError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action
 from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyStop
@@ -43,6 +44,21 @@ def drive_until_stop(car: EmulatedCar, faults: dict[str, Any]) -> SafetyStop:
     with pytest.raises(SafetyStop) as caught:
         drive()
     return caught.value
+
+
+@pytest.mark.realtime
+def test_recorded_take_is_named_before_the_first_live_pose(car: EmulatedCar) -> None:
+    reason = "Motive is in Edit mode and streams a recorded take; switch it to Live mode."
+    car.world.request(do="mocap", faults={"server_mode": 2})
+    car.clock.sleep_until(car.clock.now_s() + 2.0)
+    car.observe()
+    car.hardware.estimator.reset()
+    with pytest.raises(PoseLostError, match=f"has not seen the body yet; {reason}"):
+        car.observe()
+    with pytest.raises(NotReadyError) as caught:
+        car.arm()
+    assert reason in str(caught.value)
+    assert "markers" not in str(caught.value)
 
 
 @pytest.mark.realtime

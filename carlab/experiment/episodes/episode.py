@@ -124,11 +124,12 @@ def first_observation(car: Car, heartbeat: Callable[[str], None] = lambda where:
                 raise
         else:
             if car.clock.now_s() > deadline_s:
-                raise PoseLostError(
-                    "The frame rate of motion capture is too low to estimate the car's velocity; raise it."
-                    if observation.tracked
-                    else "Motion capture runs but does not see the car; check its markers and the volume."
-                )
+                if observation.tracked:
+                    raise PoseLostError(
+                        "The frame rate of motion capture is too low to estimate the car's velocity; raise it."
+                    )
+                remedy = " ".join(car.pose_problems()) or "check its markers and the volume."
+                raise PoseLostError(f"Motion capture runs but does not see the car; {remedy}")
         car.clock.sleep_until(car.clock.now_s() + 0.01)
 
 
