@@ -110,10 +110,15 @@ class Actuator:
         self._await(lambda s: s.is_neutral_settled, ANSWER_TIMEOUT_S)
         epoch = self._post_request(Request.MEASURE_TIMEOUT)
         status = self._await_epoch(epoch)
-        if not status.refusal:
-            limit_s = MAX_TIMEOUT_S + ANSWER_TIMEOUT_S
-            self._await(lambda s: s.epoch > epoch or not math.isnan(s.motor_timeout_s), limit_s)
-            self._await(lambda s: not s.is_motor_released, ANSWER_TIMEOUT_S)
+        if status.refusal:
+            return
+
+        def is_over(status: SenderStatus) -> bool:
+            is_cancelled = status.epoch > epoch or status.state != SenderState.CONNECTED
+            return is_cancelled or not math.isnan(status.motor_timeout_s)
+
+        self._await(is_over, MAX_TIMEOUT_S + ANSWER_TIMEOUT_S)
+        self._await(lambda s: s.state != SenderState.CONNECTED or not s.is_motor_released, ANSWER_TIMEOUT_S)
 
     def command(self, action: Action) -> Action:
         """Post the newest command and return the command on the wire, clamped and rounded by the calibration.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 from carlab.api.arguments import above_zero
 from carlab.api.runs import RunHooks, html_table
 from carlab.api.tasks import given_task, load_checked
-from carlab.core.errors import NotReadyError
+from carlab.core.errors import ActuatorFaultError, NotReadyError
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -101,7 +102,8 @@ def check(
                 latency = measure_latency(opened, period_s=choice.control_period_s)
             hardware = opened.hardware if isinstance(opened, EmulatedCar) else opened
             if isinstance(hardware, HardwareCar):
-                hardware.measure_motor_timeout()
+                with contextlib.suppress(ActuatorFaultError):  # ``health`` has the fault
+                    hardware.measure_motor_timeout()
         except (NotReadyError, TimeoutError) as error:
             problems.append(str(error))
         health = opened.health()

@@ -69,6 +69,16 @@ def test_stop_of_another_thread_ends_the_measurement_with_neutral() -> None:
         assert actuator.status().state == SenderState.FAULT
 
 
+def test_lost_link_ends_the_measurement() -> None:
+    with served(math.inf) as firmware, connected(firmware) as actuator:
+        thread = threading.Thread(target=actuator.measure_motor_timeout)
+        thread.start()
+        until(lambda: actuator.status().epoch == 1)
+        firmware.unplug()
+        thread.join(1.0)
+        assert not thread.is_alive()
+
+
 class Bench:
     """The sender's logic in neutral, with a fake clock."""
 

@@ -1,0 +1,41 @@
+"""The check of a car whose cable is pulled meanwhile."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import carlab
+from carlab.cars.emulated_world import World, WorldConfig
+from drivers.emulators.serial_firmware import SerialFirmware
+from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.waiting import until
+
+CAR = """
+[hardware.actuator]
+port = "{port}"
+[hardware.mocap]
+command_port = {command_port}
+[hardware.arena]
+corners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]
+"""
+
+
+def test_fault_during_the_check_is_a_problem_among_the_readings(tmp_path: Path) -> None:
+    with World(WorldConfig(SimulatorConfig().to_tables())) as world:
+        firmware = world.firmware
+        assert isinstance(firmware, SerialFirmware)
+
+        def pull_cable() -> None:
+            until(lambda: len(firmware.log.motor()) > 10)
+            firmware.unplug()
+
+        path = tmp_path / "car.toml"
+        path.write_text(CAR.format(**world.addresses), encoding="utf-8")
+        thread = threading.Thread(target=pull_cable)
+        thread.start()
+        found = carlab.check(path, seconds=1.5)
+        thread.join()
+    assert not found.is_ready
+    assert any("was lost" in problem for problem in found.problems)
+    assert found.health.readings["mocap_frames"] > 0
