@@ -16,7 +16,7 @@ from typing import Self
 
 from carlab.core.errors import ProtocolError
 from mocap.config import MocapConfig
-from mocap.natnet import messages
+from mocap.natnet import messages, sockets
 from mocap.natnet.bitstream_switch import BitstreamSwitch
 from mocap.natnet.message_schedule import MessageSchedule
 from mocap.natnet.models import (
@@ -28,17 +28,6 @@ from mocap.natnet.models import (
     MessageId,
     ServerMode,
     check_readable,
-)
-from mocap.natnet.sockets import (
-    DATAGRAM_BYTES,
-    DEFAULT_DATA_PORT,
-    DEFAULT_GROUP,
-    interface_towards,
-    join_group_again,
-    multicast_receiver,
-    not_ready,
-    resolve,
-    udp_socket,
 )
 from mocap.stream_statistics import MALFORMED_RUN, StreamStatistics
 from mocap.time_alignment import ClockAlignment
@@ -55,7 +44,10 @@ FrameListener = Callable[[Frame, int, float, float], None]
 
 
 class NatNetClient:
-    """Connection to one NatNet server. Constructing does nothing; ``open`` or ``with`` connects."""
+    """Connection to one NatNet server. Constructing does nothing; ``open`` or ``with`` connects.
+
+    ``on_models`` gets no definitions once the server has restarted: until it sends them, its ids may be others.
+    """
 
     def __init__(
         self,
@@ -102,16 +94,16 @@ class NatNetClient:
     def _open(self) -> None:
         config = self.config
         self._reset()
-        self._server = resolve(config.server_address)
+        self._server = sockets.resolve(config.server_address)
         local = config.local_interface
-        interface = resolve(local, "local_interface") if local else interface_towards(self._server)
-        self._command = udp_socket(interface, 0)
+        interface = sockets.resolve(local, "local_interface") if local else sockets.interface_towards(self._server)
+        self._command = sockets.udp_socket(interface, 0)
         self._stop.clear()
         self._thread = threading.Thread(target=self._receive, name="natnet-receiver", daemon=True)
         self._thread.start()
         unicast = config.mode == "unicast"
         if not self._send_until(MessageId.CONNECT, self._connect_payload(), lambda: self.server_info is not None):
-            raise not_ready(
+            raise sockets.not_ready(
                 f"no NatNet server answered at {config.server_address}:{config.command_port} within "
                 f"{config.timeout_s:g} s: is Motive streaming (Data Streaming pane, Broadcast Frame Data on), is its "
                 "Local Interface the network that this computer is on, and does its firewall let UDP pass?"
@@ -120,19 +112,21 @@ class NatNetClient:
         assert info is not None
         if info.clock_hz and info.is_multicast == unicast:
             found = "multicast" if info.is_multicast else "unicast"
-            raise not_ready(
+            raise sockets.not_ready(
                 f'{info.name} streams by {found}; set mode = "{found}" in [hardware.mocap] (listen: --mode {found}), '
                 "or change Motive."
             )
         self._agree_on_bitstream(info)
         if not unicast:
-            group = config.multicast_group or info.multicast_group or DEFAULT_GROUP
-            self._data = multicast_receiver(group, config.data_port or info.data_port or DEFAULT_DATA_PORT, interface)
+            group = config.multicast_group or info.multicast_group or sockets.DEFAULT_GROUP
+            self._data = sockets.multicast_receiver(
+                group, config.data_port or info.data_port or sockets.DEFAULT_DATA_PORT, interface
+            )
             self._group = (group, interface)
         self._polls_mode = True
         if not self._send_until(MessageId.REQUEST_MODELDEF, b"", lambda: self.models is not None):
             detail = self._statistics.last_error or "the request had no answer; restart streaming in Motive."
-            raise not_ready(f"no model definitions within {config.timeout_s:g} s: {detail}")
+            raise sockets.not_ready(f"no model definitions within {config.timeout_s:g} s: {detail}")
         if info.clock_hz:
             # The thread sends the echoes; without answers, capture times are times of arrival.
             self._wait(lambda: self.alignment.echoes >= MIN_ECHOES, config.timeout_s)
@@ -153,7 +147,7 @@ class NatNetClient:
         try:
             check_readable(info.bitstream)
         except ProtocolError as error:
-            raise not_ready(str(error)) from error
+            raise sockets.not_ready(str(error)) from error
 
     def close(self) -> None:
         """Disconnect, stop the thread, close the sockets. Idempotent, safe after a failed open."""
@@ -231,11 +225,9 @@ class NatNetClient:
         wanted = self.config.bitstream_version if self.config.mode == "unicast" else None
         return messages.encode_connect("carlab", bitstream=wanted)
 
-    def _send_until(
-        self, message_id: int, payload: bytes, answered: Callable[[], bool], timeout_s: float | None = None
-    ) -> bool:
-        """Send a message repeatedly until ``ready``; False after the time-out."""
-        deadline_s = time.monotonic() + (self.config.timeout_s if timeout_s is None else timeout_s)
+    def _send_until(self, message_id: int, payload: bytes, answered: Callable[[], bool]) -> bool:
+        """Send a message repeatedly until ``answered``; False after the time-out."""
+        deadline_s = time.monotonic() + self.config.timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             self._send(message_id, payload)
             if self._wait(answered, min(RETRY_PERIOD_S, left_s)):
@@ -247,7 +239,7 @@ class NatNetClient:
         with self._changed:
             self._changed.wait_for(lambda: ready() or self._failure is not None, timeout_s)
             if self._failure is not None:
-                raise not_ready(f"{self.last_error}; close it and open it again.") from self._failure
+                raise sockets.not_ready(f"{self.last_error}; close it and open it again.") from self._failure
             return ready()
 
     def _send(self, message_id: int, payload: bytes = b"") -> None:
@@ -273,11 +265,11 @@ class NatNetClient:
                 self._changed.notify_all()
 
     def _receive_once(self) -> None:
-        sockets = [s for s in (self._command, self._data) if s is not None]
-        ready, _, _ = select.select(sockets, [], [], WAKE_PERIOD_S)
+        listening = [s for s in (self._command, self._data) if s is not None]
+        ready, _, _ = select.select(listening, [], [], WAKE_PERIOD_S)
         for sock in ready:
             try:
-                datagram, source = sock.recvfrom(DATAGRAM_BYTES)
+                datagram, source = sock.recvfrom(sockets.DATAGRAM_BYTES)
             except OSError as error:
                 # BlockingIOError: no datagram after all; others: the network is down briefly.
                 if not isinstance(error, BlockingIOError):
@@ -309,7 +301,7 @@ class NatNetClient:
         models: tuple[Description, ...] | None = None
         with self._changed:
             if message_id == MessageId.SERVERINFO:
-                self._handle_server_info(messages.decode_server_info(payload))
+                models = () if self._handle_server_info(messages.decode_server_info(payload)) else None
             elif message_id == MessageId.ECHORESPONSE:
                 stamp, ticks = messages.decode_echo_response(payload)
                 self.alignment.add_echo(stamp * 1e-9, ticks, received_s)
@@ -324,11 +316,11 @@ class NatNetClient:
         if models is not None and self._on_models is not None:
             self._on_models(models)
 
-    def _handle_server_info(self, info: messages.ServerInfo) -> None:
-        """Store the server's information. After a reconnect the server may be a different one."""
+    def _handle_server_info(self, info: messages.ServerInfo) -> bool:
+        """Store the server's information; returns whether the server may be a different one, after a reconnect."""
         before = self.server_info
         if before == info and not self._schedule.reconnecting:
-            return
+            return False
         self._schedule.note_server_info(time.monotonic())
         self.server_info = info
         self._decoder = BitstreamSwitch(info.bitstream)
@@ -341,6 +333,7 @@ class NatNetClient:
                 self._send(MessageId.REQUEST, messages.encode_request(f"Bitstream,{self.config.bitstream}"))
         if before is None or before.clock_hz != info.clock_hz:
             self.alignment = ClockAlignment(float(info.clock_hz))
+        return before is not None
 
     def _handle_response(self, response: messages.Response | None) -> None:
         """Store the answer to the request for the mode, or to that for a bitstream version before."""
@@ -362,13 +355,17 @@ class NatNetClient:
         frame = self._decoder.decode_frame(payload)
         self._schedule.note_frame(received_s)
         with self._changed:
+            restarts = self._statistics.restarts
             sequence = self._statistics.accept(frame.frame_number, received_s)
             if sequence is None:
                 return
             capture_s = self._capture_time(frame, received_s)
             self._is_recording = bool(frame.params & FRAME_RECORDING)
-            if frame.params & FRAME_MODELS_CHANGED:
+            has_restarted = self._statistics.restarts > restarts
+            if frame.params & FRAME_MODELS_CHANGED or has_restarted:
                 self._schedule.models_outdated = True
+        if has_restarted and self._on_models is not None:
+            self._on_models(())
         if self._on_frame is not None:
             self._on_frame(frame, sequence, capture_s, received_s)
 
@@ -396,4 +393,4 @@ class NatNetClient:
         for message_id in self._schedule.due(now_s, has_clock=has_clock, settled=settled, polls_mode=polls_mode):
             self._send(message_id, payloads.get(message_id, bytes)())
             if message_id == MessageId.CONNECT and self._data is not None:
-                join_group_again(self._data, *self._group)
+                sockets.join_group_again(self._data, *self._group)
