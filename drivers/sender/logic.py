@@ -99,6 +99,7 @@ class SenderLogic:
         self.sent_number = 0
         self.t_sent_issued_s = 0.0
         self._is_link_up = False
+        self._unready_cause = ""
         self._order: Order | None = None
         self._decided: Order | None = None
         self._is_watchdog_tripped = False
@@ -124,21 +125,19 @@ class SenderLogic:
 
     def link_failed(self, text: str) -> None:
         """Event: the link has failed; latches a fault, except during shutdown."""
-        self._is_link_up = False
         self.t_values_s = None
-        self._latch(text)
+        self._latch_unready(text)
         if self._is_shutting_down:
             self.is_finished = True
 
     def firmware(self, version: FirmwareIdentity) -> None:
         """Event: version received; a different board or an unsupported version latches a fault."""
         if self.version is not None and version.uuid != self.version.uuid:
-            self._is_link_up = False
-            self._latch(f"a different {self.config.device_kind.name} answers; close the car and open it again.")
+            self._latch_unready(f"a different {self.config.device_kind.name} answers; close the car and open it again.")
             return
         self.version = version
         if (refusal := version.refusal()) is not None:
-            self._latch(refusal)
+            self._latch_unready(refusal)
 
     def telemetry(self, t_s: float, values: Telemetry) -> None:
         """Event: telemetry received; a fault of the firmware or its kill switch latches a fault.
@@ -265,7 +264,7 @@ class SenderLogic:
         if self.state != SenderState.FAULT:
             return
         if not self.is_ready_to_send:
-            self.refusal = self.fault
+            self.refusal = self._unready_cause
         elif self.telemetry_age_s(now_s) > self.config.telemetry_stale_s:
             name = self.config.device_kind.name
             self.refusal = f"the {name} does not answer; check its power and cable, then reset the fault again."
@@ -319,6 +318,12 @@ class SenderLogic:
         if not self._is_watchdog_tripped:
             self._is_watchdog_tripped = True
             self.watchdog_trips += 1
+
+    def _latch_unready(self, text: str) -> None:
+        """Latch a fault of the link; the cause is the reason why a fault, also an earlier one, cannot be reset."""
+        self._is_link_up = False
+        self._unready_cause = text
+        self._latch(text)
 
     def _latch(self, text: str) -> None:
         if self.state != SenderState.FAULT:

@@ -73,6 +73,18 @@ def armed() -> Bench:
     return bench
 
 
+def test_reset_names_the_present_cause_if_the_link_was_lost_after_another_fault() -> None:
+    bench = armed()
+    bench.send_request(Request.STOP_AND_LATCH)
+    bench.logic.link_failed("the port was lost; check the cable, then reset the fault.")
+    bench.send_request(Request.RESET_FAULT)
+    assert bench.logic.refusal == "the port was lost; check the cable, then reset the fault."
+    bench.logic.link_up()
+    bench.tick()
+    bench.send_request(Request.RESET_FAULT)
+    assert bench.logic.state == SenderState.CONNECTED
+
+
 def test_no_command_before_the_firmware_is_known_and_neutral_before_arming() -> None:
     bench = Bench()
     assert bench.tick() is None
