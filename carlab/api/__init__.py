@@ -11,10 +11,11 @@ from carlab.api.comparison import compare
 from carlab.api.diagnosis import DiagnosisReport, diagnose
 from carlab.api.drive_run import DriveRun
 from carlab.api.driving import drive, replay
-from carlab.api.learning import LearnHooks, LearnRun, learn
+from carlab.api.learning import LearnRun, learn
 from carlab.api.prediction import PredictionErrors, predict
 from carlab.api.recordings import Recording, load, save_run
-from carlab.api.runs import RunHooks
+from carlab.experiment.campaign.hooks import LearnHooks
+from carlab.experiment.episodes.hooks import RunHooks
 
 __all__ = [
     "CarCheck",

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.api.arguments import above_zero
-from carlab.api.runs import RunHooks, html_table
+from carlab.api.runs import html_table
 from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ActuatorFaultError, NotReadyError
+from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile

@@ -15,7 +15,7 @@ from carlab.core.errors import add_sentence
 
 if TYPE_CHECKING:
     from carlab.core.outcome import EndReason
-    from carlab.experiment.episodes.session import EpisodeResult
+    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.api.drive_run import DriveRun, run_results
 from carlab.api.runs import (
-    RunHooks,
     collecting,
     followed_by,
     has_screen,
@@ -23,6 +22,7 @@ from carlab.api.runs import (
 from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError, NotReadyError
 from carlab.core.manoeuvres import MANOEUVRES
+from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
     from carlab.api.recordings import Recording
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from carlab.core.safety import SafetyEnvelope
     from carlab.core.task import Task
     from carlab.core.task_choice import TaskChoice
-    from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
+    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.experiment.episodes.teleop_policy import TeleopPolicy
     from carlab.recording.run_folder import RunDirectory
     from sim_backends.car_parameters import SimulatorConfig
@@ -201,17 +201,17 @@ def _drive(
     driver, teleop = _policy(policy, max_throttle, choice.simulator, envelope, options["seed"])
     if options["max_ticks"] is None:
         options = {**options, "max_ticks": _ticks(policy, choice.control_period_s)}
-    session_hooks = hooks.session()
     with contextlib.ExitStack() as signals, contextlib.ExitStack() as stack:
         if teleop is not None:
-            session_hooks = _by_hand(session_hooks, teleop, choice.car.clock)
-            options = {**options, "max_ticks": options["max_ticks"] or TELEOP_MAX_TICKS}
+            hooks = _in_real_time(hooks, choice.car.clock)
+            max_ticks = options["max_ticks"] or TELEOP_MAX_TICKS
+            options = {**options, "max_ticks": max_ticks, "stop_reason": teleop.stop_reason}
             stack.enter_context(teleop)
         stack.enter_context(choice.car)
         signals.enter_context(Interrupts())
         session = Session(
             choice.car, driver, task, envelope, run, choice.control_period_s, config_toml=choice.config_toml,
-            hooks=session_hooks, **options,
+            hooks=hooks, **options,
         )  # fmt: skip
         return session.drive(episodes)
 
@@ -353,12 +353,12 @@ def _policy(
     return ManoeuvrePolicy(MANOEUVRES[policy]()), None
 
 
-def _by_hand(hooks: SessionHooks, teleop: TeleopPolicy, clock: Clock) -> SessionHooks:
-    """Hooks for teleoperation: the dead-man control ends an episode, and a simulated car runs in real time."""
+def _in_real_time(hooks: RunHooks, clock: Clock) -> RunHooks:
+    """Hooks with which a simulated car runs in real time, for teleoperation."""
     from carlab.core.clock import MonotonicClock
 
     if isinstance(clock, MonotonicClock):
-        return replace(hooks, stop_reason=teleop.stop_reason)
+        return hooks
     wall = MonotonicClock()
     offset_s = [0.0]
     on_episode: Callable[[int, int], None] = hooks.on_episode
@@ -372,4 +372,4 @@ def _by_hand(hooks: SessionHooks, teleop: TeleopPolicy, clock: Clock) -> Session
         on_tick(tick)
         wall.sleep_until(offset_s[0] + tick.t_s)
 
-    return replace(hooks, stop_reason=teleop.stop_reason, on_episode=begin, on_tick=wait)
+    return replace(hooks, on_episode=begin, on_tick=wait)

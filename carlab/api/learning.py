@@ -5,15 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import platform
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from carlab.api.arguments import above_zero, at_least, at_most, valid_seed, whole_number
 from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
-    RunHooks,
     check_learning_run,
     existing_run,
     followed_by,
@@ -27,49 +25,24 @@ from carlab.api.runs import (
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
 from carlab.core.method_names import current_method
+from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
     from carlab.core.outcome import EndReason
     from carlab.core.task import Task
-    from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+    from carlab.experiment.campaign.campaign import Campaign
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
-    from carlab.experiment.campaign.prior_correction import PriorVersion
     from carlab.experiment.campaign.quick_check import EpisodeCheck
     from carlab.experiment.cluster.trainer import ClusterTrainer
-    from carlab.experiment.episodes.interrupts import Interrupts
-    from carlab.experiment.episodes.session import EpisodeResult
+    from carlab.experiment.episodes.hooks import RunHooks
+    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 EPISODES = 20
 PLAN_ARGUMENTS = ("method", "history", "model_steps", "updates", "seed", "ticks")
 """Arguments that are part of the training plan of a run."""
-
-
-@dataclass(slots=True)
-class LearnHooks(RunHooks):
-    """Callbacks of a learning run; the defaults do nothing.
-
-    Attributes:
-        on_training: receives activity, steps done and total steps.
-        on_learned: receives the figures of a finished training.
-        on_figures: receives the figures of a finished episode.
-        on_checking: called before the quick check of an episode against the simulator.
-        on_check: receives the result of the quick check.
-        on_correcting: called before the correction of the prior (``prior="auto"``).
-        on_prior: receives the version of the prior after the correction, with the sentence that states what changed.
-        on_link: receives a sentence when the cluster does not answer, is replaced by this computer, or answers again.
-    """
-
-    on_training: Callable[[str, int, int], None] = lambda activity, done, total: None
-    on_learned: Callable[[dict[str, Any]], None] = lambda figures: None
-    on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
-    on_checking: Callable[[], None] = lambda: None
-    on_check: Callable[[EpisodeCheck], None] = lambda check: None
-    on_correcting: Callable[[], None] = lambda: None
-    on_prior: Callable[[PriorVersion], None] = lambda version: None
-    on_link: Callable[[str], None] = lambda sentence: None
 
 
 @dataclass(frozen=True)
@@ -139,7 +112,7 @@ def learn(
     resume: Path | str | None = None, out: Path | str | None = None, name: str | None = None, rerun: bool | None = None,
     live: bool = False, viewer: str | None = None, vehicle: str | Path | CarFile | None = None,
     reality: str | Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
-    hooks: LearnHooks | None = None,
+    hooks: RunHooks | None = None,
 ) -> LearnRun:  # fmt: skip
     """Fit a model of the car (the learned car), train a policy in it, drive an episode with the policy, and repeat.
 
@@ -171,7 +144,7 @@ def learn(
         dry_run: measure and compute commands, but send none to the car.
         ray: train on Ray: ``local``, or the address of a cluster; empty: a child process. The car stays here.
         ray_wait: time without an answer of the cluster after which a training runs on this computer [s].
-        hooks: callbacks.
+        hooks: callbacks: ``carlab.LearnHooks``, or ``carlab.RunHooks``.
 
     Returns:
         The run; ``is_complete`` is False after an interruption or a safety stop.
@@ -185,7 +158,8 @@ def learn(
         given["resume"] = Path(resume)
     if method is not None:
         given["method"] = current_method(method)
-    return _learn(LearnRequest(**given, given=frozenset(given)), hooks or LearnHooks())
+    callbacks = {f.name: getattr(hooks, f.name) for f in fields(LearnHooks) if hasattr(hooks, f.name)}
+    return _learn(LearnRequest(**given, given=frozenset(given)), LearnHooks(**callbacks))
 
 
 @dataclass(slots=True)
@@ -210,22 +184,6 @@ class _Progress:
             self.rows[-1] = self.rows[-1].with_check(check)
         save_check(self.run, check)
         self.hooks.on_check(check)
-
-    def campaign_hooks(self, interrupts: Interrupts) -> CampaignHooks:
-        from carlab.experiment.campaign.campaign import CampaignHooks
-
-        own = self.hooks
-        return CampaignHooks(
-            own.session(),
-            own.on_training,
-            own.on_learned,
-            self.on_figures,
-            own.on_checking,
-            self.on_check,
-            own.on_correcting,
-            own.on_prior,
-            interrupts.requested.is_set,
-        )
 
 
 def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
@@ -257,7 +215,8 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
             campaign.trainer = stack.enter_context(_cluster_trainer(request, campaign, hooks))
         progress = _Progress(campaign.run, hooks)
         stack.enter_context(choice.car)
-        campaign.hooks = progress.campaign_hooks(signals.enter_context(Interrupts()))  # until the car is closed
+        campaign.hooks = replace(hooks, on_figures=progress.on_figures, on_check=progress.on_check)
+        campaign.stop = signals.enter_context(Interrupts()).requested.is_set  # until the car is closed
         if request.resume is None:
             campaign.write_plan()
         elif request.episodes is not None and request.episodes != campaign.episodes:
@@ -265,7 +224,6 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
             campaign.write_plan()
         for result in campaign.run_episodes():
             results.append(result)
-            hooks.on_result(result)
             write_report(campaign.run, campaign.plan, progress.rows[-1])
             write_result(campaign.run, results)
     return LearnRun(campaign.run.path, campaign.episodes, tuple(progress.rows), tuple(results))
@@ -323,18 +281,18 @@ def _check(request: LearnRequest) -> None:
 
 
 def _begun(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
-    from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+    from carlab.experiment.campaign.campaign import Campaign
 
     plan = training_plan(request, choice)
     run = stack.enter_context(new_run(request.out, request.name, choice, hooks, keep="models"))
     return Campaign(
-        choice, plan, request.episodes or EPISODES, run, CampaignHooks(), request.ticks, request.place, request.rerun,
+        choice, plan, request.episodes or EPISODES, run, hooks, request.ticks, request.place, request.rerun,
         checked_simulator(request), request.car_options, request.prior == AUTO,
     )  # fmt: skip
 
 
 def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
-    from carlab.experiment.campaign.campaign import CampaignHooks, check_same_car, resumed_campaign
+    from carlab.experiment.campaign.campaign import check_same_car, resumed_campaign
     from carlab.experiment.campaign.report import restore_missing_rows
     from learning.devices import available
 
@@ -342,7 +300,7 @@ def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack:
     run = stack.enter_context(existing_run(request.resume, choice, hooks))
     check_same_car(run, choice, request.car_options)
     with learning_run(request.resume):
-        campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
+        campaign = resumed_campaign(run, choice, request.device)
     task_choice = campaign.plan.task_choice.named_again(given_task(request.task, request.track, choice.track))
     campaign.plan = replace(campaign.plan, task_choice=task_choice)
     load_checked(task_choice, choice.envelope.arena_m)

@@ -1,4 +1,4 @@
-"""Common parts of the calls that drive a car: hooks, the run's folder, and its results."""
+"""Common parts of the calls that drive a car: the run's folder, and its results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
@@ -25,59 +25,11 @@ if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from carlab.cars import CarChoice
-    from carlab.core.car import Car
-    from carlab.core.documents import Document, Tick
-    from carlab.core.outcome import EndReason
-    from carlab.core.quantities import CarState
-    from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
+    from carlab.experiment.episodes.hooks import RunHooks
+    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 P = ParamSpec("P")
-
-
-def _refuse_to_place(start: CarState) -> None:
-    raise ConfigError(
-        f"The car cannot move to x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad by itself; "
-        "pass place=False to start at its current pose, or hooks with a place_by_hand that prompts a person."
-    )
-
-
-@dataclass(slots=True)
-class RunHooks:
-    """Callbacks while a car is driven; the defaults do nothing.
-
-    Attributes:
-        on_start: receives the run's folder and the car, before the car is opened.
-        place_by_hand: receives a start pose that the car cannot reach by itself; returns when the car is there.
-        on_episode: receives the number of a starting episode and its maximum number of ticks.
-        on_tick: receives each tick.
-        on_document: receives each document of the control loop; it must return at once.
-        on_result: receives each finished episode.
-        on_abandon: receives reason and detail after the control loop hung and the car was stopped; it may end the
-            process. Otherwise, if the loop resumes, the episode ends with LOOP_HUNG, or SafetyStop is raised if the
-            loop itself fails because the car is closed.
-    """
-
-    on_start: Callable[[Path, Car], None] = lambda folder, car: None
-    place_by_hand: Callable[[CarState], None] = _refuse_to_place
-    on_episode: Callable[[int, int], None] = lambda episode, ticks: None
-    on_tick: Callable[[Tick], None] = lambda tick: None
-    on_document: Callable[[Document], None] = lambda document: None
-    on_result: Callable[[EpisodeResult], None] = lambda result: None
-    on_abandon: Callable[[EndReason, str], None] = lambda reason, detail: None
-
-    def session(self) -> SessionHooks:
-        """The hooks of a session."""
-        from carlab.experiment.episodes.session import SessionHooks
-
-        return SessionHooks(
-            place_by_hand=self.place_by_hand,
-            on_episode=self.on_episode,
-            on_tick=self.on_tick,
-            on_document=self.on_document,
-            on_result=self.on_result,
-            on_abandon=self.on_abandon,
-        )
 
 
 @contextmanager

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from rich.text import Text
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, readings_table, table
 from carlab.cli.options import CarOptions, TaskOptions, arguments_of
 from carlab.core.errors import NotReadyError
+from carlab.experiment.episodes.hooks import RunHooks
 
 
 @dataclass

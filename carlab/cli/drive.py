@@ -16,10 +16,10 @@ from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import CarOptions, TaskOptions, arguments_of
 from carlab.cli.runs import common_hooks, figure_text, heading
+from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
     from carlab.api import DriveRun
-    from carlab.api.runs import RunHooks
     from carlab.core.documents import Tick
 
 
@@ -87,8 +87,6 @@ class Drive:
         return self._report(run)
 
     def _hooks(self, bar: Progress) -> RunHooks:
-        from carlab.api.runs import RunHooks
-
         rows: list[TaskID] = []
 
         def on_episode(number: int, ticks: int) -> None:

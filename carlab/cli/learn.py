@@ -18,10 +18,10 @@ from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import CarOptions, TaskOptions, arguments_of
 from carlab.cli.runs import common_hooks, figure_text, heading
+from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
     from carlab.api import LearnRun
-    from carlab.api.learning import LearnHooks
     from carlab.core.documents import Tick
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.quick_check import EpisodeCheck
@@ -147,8 +147,6 @@ class Learn:
         return self._report(run)
 
     def _hooks(self, bar: Progress) -> LearnHooks:
-        from carlab.api.learning import LearnHooks
-
         rows: dict[str, TaskID] = {}
 
         def show_progress(activity: str, done: int, total: int) -> None:

@@ -11,7 +11,6 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from carlab.api.arguments import above_zero, valid_seed
 from carlab.api.recordings import load
-from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.options import CarOptions, arguments_of, new_file
 from carlab.cli.recordings import print_errors, print_recording
@@ -19,6 +18,7 @@ from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
+from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
     from carlab.api import PredictionErrors

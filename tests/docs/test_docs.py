@@ -21,7 +21,7 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import CarState, Observation
 from carlab.core.safety import SafetyEnvelope
 from carlab.diagnosis.findings import EffectFinding, Estimate, FitErrors
-from carlab.experiment.episodes.session import EpisodeResult
+from carlab.experiment.episodes.result import EpisodeResult
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from mocap.config import MocapConfig

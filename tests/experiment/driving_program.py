@@ -19,7 +19,8 @@ from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState
 from carlab.core.task import RecordedTask
-from carlab.experiment.episodes.session import Session, SessionHooks
+from carlab.experiment.episodes.hooks import RunHooks
+from carlab.experiment.episodes.session import Session
 from carlab.recording.rerun.sink import RerunSink
 from carlab.recording.run_folder import RunDirectory
 
@@ -100,7 +101,7 @@ def main(folder: str, misbehaviour: str) -> int:
             run,
             1 / 30,
             record_rerun=misbehaviour == "recorder_error",
-            hooks=SessionHooks(on_tick=on_tick, on_abandon=on_abandon),
+            hooks=RunHooks(on_tick=on_tick, on_abandon=on_abandon),
             hang_timeout_s=1.0,
         )
         results = session.drive(1)

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -25,13 +26,13 @@ from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import CarState, Reality
 from carlab.experiment.campaign import training
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign, saved_plan
+from carlab.experiment.campaign.campaign import Campaign, resumed_campaign, saved_plan
 from carlab.experiment.campaign.figures import EpisodeFigures, predict_windows
+from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.report import learning_curve, restore_missing_rows, save_row, write_report
 from carlab.experiment.campaign.run_recording import write_run_recording
 from carlab.experiment.campaign.training import recorded_features
-from carlab.experiment.episodes.session import SessionHooks
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.pipe_file import PipeFile
@@ -51,13 +52,15 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
     run = RunDirectory.create(tmp_path_factory.mktemp("runs"), "learn")
     record = InterruptedRun(run, tiny_plan(choice), log_sent_actions(choice))
 
-    def run_episodes(hooks: CampaignHooks) -> None:
-        hooks.on_figures = record.figures.append
-        campaign = Campaign(choice, record.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
+    def run_episodes(on_training: Callable[[str, int, int], None], stop: Callable[[], bool] = lambda: False) -> None:
+        hooks = LearnHooks(on_training=on_training, on_figures=record.figures.append)
+        campaign = Campaign(choice, record.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False, stop=stop)
         campaign.write_plan()
         for result in campaign.run_episodes():
             record.results.append(result)
             write_report(run, record.plan, record.figures[-1])
+
+    def go_on(stage: str, done: int, total: int) -> None: ...
 
     def kill(stage: str, done: int, total: int) -> None:
         if record.results and stage == "learning to drive":
@@ -67,16 +70,16 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
             os.kill(child.pid or 0, signal.SIGKILL)
 
     with choice.car:
-        run_episodes(CampaignHooks(stop=(run.models / "0001").is_dir))
+        run_episodes(go_on, (run.models / "0001").is_dir)
         record.files_after_stop = names(run)
         record.first_model = (run.models / "0001" / "policy.npz").read_bytes()
         with pytest.raises(DataError) as error:
-            run_episodes(CampaignHooks(on_training=kill))
+            run_episodes(kill)
         record.error_text = str(error.value)
         record.files_after_kill = names(run)
         (run.models / "0002.partial").mkdir()  # as after a kill of the whole program
         (run.models / "0002.partial" / "policy.npz").write_bytes(b"rubbish")
-        run_episodes(CampaignHooks())
+        run_episodes(go_on)
     return record
 
 
@@ -106,7 +109,7 @@ def test_complete_run_trains_and_drives_nothing(interrupted: InterruptedRun) -> 
 
 
 def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, tmp_path: Path) -> None:
-    resumed = resumed_campaign(interrupted.run, choose_car("sim"), CampaignHooks())
+    resumed = resumed_campaign(interrupted.run, choose_car("sim"))
     assert (resumed.plan, resumed.episodes, resumed.max_ticks) == (interrupted.plan, 2, TICKS)
     assert (resumed.place, resumed.record_rerun) == (True, False)
     invalid_run = RunDirectory.create(tmp_path, "other")
@@ -126,7 +129,7 @@ def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, 
         if content is not None:
             (invalid_run.path / "campaign.json").write_text(content)
         with pytest.raises(DataError, match="cannot be resumed"):
-            resumed_campaign(invalid_run, choose_car("sim"), CampaignHooks())
+            resumed_campaign(invalid_run, choose_car("sim"))
         with pytest.raises(DataError, match="is not the folder of a run of carlab learn"):
             saved_plan(invalid_run.path)
 
@@ -258,7 +261,7 @@ def test_interrupted_episode_is_kept_and_repeated(interrupted: InterruptedRun, t
 
     choice = choose_car("sim", seed=0)
     figures: list[EpisodeFigures] = []
-    hooks = CampaignHooks(SessionHooks(on_tick=on_tick), on_figures=figures.append)
+    hooks = LearnHooks(on_tick=on_tick, on_figures=figures.append)
     campaign = Campaign(choice, interrupted.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
     with choice.car:
         assert list(campaign.run_episodes()) == []
@@ -277,7 +280,7 @@ def test_episode_of_a_car_that_cannot_be_armed_is_repeated(
     shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
     choice = choose_car("sim", seed=0)
     figures: list[EpisodeFigures] = []
-    hooks = CampaignHooks(on_figures=figures.append)
+    hooks = LearnHooks(on_figures=figures.append)
     campaign = Campaign(choice, interrupted.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
 
     def refuse() -> None:

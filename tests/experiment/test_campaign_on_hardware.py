@@ -14,9 +14,9 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Tick
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+from carlab.experiment.campaign.campaign import Campaign
+from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.campaign.training import train
-from carlab.experiment.episodes.session import SessionHooks
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import read_log
@@ -70,9 +70,7 @@ def test_training_and_driving_do_not_overlap(tmp_path: Path) -> None:
         child_names.extend(child.name for child in multiprocessing.active_children())
         ticks_s.append(tick.t_s)
 
-    hooks = CampaignHooks(
-        SessionHooks(on_tick=on_tick), on_training=lambda stage, done, total: progress_s.append(clock.now_s())
-    )
+    hooks = LearnHooks(on_tick=on_tick, on_training=lambda stage, done, total: progress_s.append(clock.now_s()))
     with choice.car:
         campaign = Campaign(choice, tiny_plan(choice), 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         assert len(list(campaign.run_episodes())) == 2

@@ -27,12 +27,12 @@ from tcp_link import TcpLink, free_port, wait_for_port
 from carlab.cars import choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Tick
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+from carlab.experiment.campaign.campaign import Campaign
+from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.campaign.training_process import train_in_subprocess
 from carlab.experiment.cluster.link_process import LinkProcess
 from carlab.experiment.cluster.settings import LinkSettings
 from carlab.experiment.cluster.trainer import ClusterTrainer
-from carlab.experiment.episodes.session import SessionHooks
 from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import read_log
 
@@ -150,8 +150,8 @@ def learn_with_cuts(cluster: Cluster, tmp_path: Path) -> LearningRun:
         run.here.append(len(recordings) + 1)
         return train_in_subprocess(plan, models, recordings, *others)
 
-    hooks = CampaignHooks(
-        SessionHooks(on_tick=on_tick, on_episode=lambda number, ticks: run.ticks_s.append([])), on_training=on_training
+    hooks = LearnHooks(
+        on_tick=on_tick, on_episode=lambda number, ticks: run.ticks_s.append([]), on_training=on_training
     )
     link = LinkProcess(cluster.address, f"test {os.getpid()} {tmp_path.name}", "cpu", cluster.program)
     trainer = ClusterTrainer(cluster.address, link, say, cluster.settings, train_here)
@@ -220,7 +220,7 @@ def test_training_of_a_killed_worker_starts_again(tmp_path: Path) -> None:
         trainer = ClusterTrainer(cluster.address, link, said.append, cluster.settings, train_here)
         with trainer, choice.car:
             campaign = Campaign(
-                choice, tiny_plan(choice), 1, run, CampaignHooks(on_training=on_training), max_ticks=TICKS,
+                choice, tiny_plan(choice), 1, run, LearnHooks(on_training=on_training), max_ticks=TICKS,
                 record_rerun=False, trainer=trainer,
             )  # fmt: skip
             assert len(list(campaign.run_episodes())) == 1
@@ -258,7 +258,7 @@ def test_stopped_link_process_is_a_slow_link_and_is_replaced(tmp_path: Path) -> 
         )
         with trainer, choice.car:
             campaign = Campaign(
-                choice, tiny_plan(choice), 1, run, CampaignHooks(on_training=on_training), max_ticks=TICKS,
+                choice, tiny_plan(choice), 1, run, LearnHooks(on_training=on_training), max_ticks=TICKS,
                 record_rerun=False, trainer=trainer,
             )  # fmt: skip
             assert len(list(campaign.run_episodes())) == 1

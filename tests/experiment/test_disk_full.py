@@ -20,8 +20,10 @@ from carlab.core.task import ParkingTask
 from carlab.experiment.campaign.campaign import Campaign
 from carlab.experiment.campaign.training import model_folder
 from carlab.experiment.campaign.training_plan import TrainingPlan
+from carlab.experiment.episodes.hooks import RunHooks
+from carlab.experiment.episodes.result import EpisodeResult
 from carlab.experiment.episodes.scripted_policies import NeutralPolicy
-from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
+from carlab.experiment.episodes.session import Session
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import CommandLog
@@ -55,7 +57,7 @@ def test_recording_that_cannot_be_finished_ends_the_run(
     with SimulatedCar() as car:
         session = Session(
             car, NeutralPolicy(), ParkingTask(), SafetyEnvelope(), run, 1 / 30, max_ticks=400, record_rerun=False,
-            hooks=SessionHooks(),
+            hooks=RunHooks(),
         )  # fmt: skip
         (result,) = session.drive(3)
     assert result.reason is EndReason.RECORDER_ERROR

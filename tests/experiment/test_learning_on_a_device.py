@@ -15,7 +15,7 @@ import torch
 
 from carlab.cars import choose_car
 from carlab.experiment.campaign import campaign, training
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, prior_simulator, resumed_campaign
+from carlab.experiment.campaign.campaign import Campaign, prior_simulator, resumed_campaign
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.episodes.session import Session
 from carlab.recording.run_folder import RunDirectory
@@ -91,9 +91,9 @@ def test_run_trains_on_the_device_and_drives_on_the_cpu(
     assert figures["rows"] == SMALL["ticks"] - SMALL["history"]
     assert np.isfinite(figures["last_episode_nll"])
     choice = choose_car("sim", seed=0)
-    assert resumed_campaign(device_run, choice, CampaignHooks()).plan.device == "cuda"
-    assert resumed_campaign(device_run, choice, CampaignHooks(), "cpu").plan.device == "cpu"
+    assert resumed_campaign(device_run, choice).plan.device == "cuda"
+    assert resumed_campaign(device_run, choice, "cpu").plan.device == "cpu"
     without_device = json.loads((device_run.path / campaign.CAMPAIGN_FILE).read_text())
     del without_device["plan"]["device"]
     (device_run.path / campaign.CAMPAIGN_FILE).write_text(json.dumps(without_device))
-    assert resumed_campaign(device_run, choice, CampaignHooks()).plan.device == "cpu"
+    assert resumed_campaign(device_run, choice).plan.device == "cpu"

@@ -22,8 +22,9 @@ from carlab.core.documents import Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.diagnosis.diagnose import diagnose
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
+from carlab.experiment.campaign.campaign import Campaign, resumed_campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.campaign.learned_policy import load_policy
 from carlab.experiment.campaign.prior_correction import (
     PARAMETERS,
@@ -257,7 +258,7 @@ def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: P
     version = PriorVersion((MOTOR_LAG,), 4, "The prior changes after episode 1: motor_lag is added.")
     sentences: list[str] = []
     figures: list[EpisodeFigures] = []
-    hooks = CampaignHooks(on_prior=lambda v: sentences.append(v.sentence), on_figures=figures.append)
+    hooks = LearnHooks(on_prior=lambda v: sentences.append(v.sentence), on_figures=figures.append)
 
     def scripted(request: CorrectionRequest, stop: Callable[[], bool]) -> PriorVersion:
         assert (len(request.recordings), request.before) == (1, PriorVersion(history=2))
@@ -269,8 +270,8 @@ def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: P
     with choice.car:
         campaign.write_plan()
         assert len(list(campaign.run_episodes())) == 1
-        resumed = resumed_campaign(run, choice, hooks)
-        resumed.correct, resumed.episodes = scripted, 2
+        resumed = resumed_campaign(run, choice)
+        resumed.hooks, resumed.correct, resumed.episodes = hooks, scripted, 2
         assert len(list(resumed.run_episodes())) == 1
     assert sentences == [version.sentence]
     assert (run.models / "0001" / "prior.toml").read_text() == plan.prior_toml
@@ -280,7 +281,7 @@ def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: P
     assert [len(t[0].features) for t in ticks] == [7 + 2 * 2, 7 + 2 * 4], "the policy observes two more past commands"
     assert [f.prior_change for f in figures] == ["", version.sentence]
     assert all(f.predicted_low <= f.predicted_return <= f.predicted_high for f in figures)
-    again = resumed_campaign(run, choice, hooks)
+    again = resumed_campaign(run, choice)
     assert again.current_plan(2).prior_toml == (run.models / "0002" / "prior.toml").read_text()
     for policy, history in ((run.path, 4), (run.models / "0002", 4), (run.models / "0001", 2)):
         driven = drive("sim", policy=policy, ticks=3, out=tmp_path / "driven", rerun=False, picture=False)

@@ -11,8 +11,9 @@ import pytest
 
 from carlab.cars import choose_car
 from carlab.core.errors import DataError
-from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+from carlab.experiment.campaign.campaign import Campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.campaign.quick_check import EpisodeCheck, check, check_path, run_check_subprocess
 from carlab.experiment.campaign.report import learning_curve, save_check, save_row
 from carlab.experiment.campaign.training_plan import TrainingPlan
@@ -72,7 +73,7 @@ def test_stopped_check_writes_nothing_and_is_repeated(tmp_path: Path) -> None:
         checks.append(check_result)
         save_check(run, check_result)
 
-    campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, CampaignHooks(on_check=on_check))
+    campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, LearnHooks(on_check=on_check))
     assert list(campaign.run_episodes()) == []
     assert [t.verdict for t in checks] == ["explains"]
     (row,) = learning_curve(run)

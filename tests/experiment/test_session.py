@@ -18,7 +18,8 @@ from carlab.core.quantities import Action, CarState, Observation
 from carlab.core.safety import SafetyEnvelope, SafetyStop
 from carlab.core.task import ParkingTask
 from carlab.experiment.episodes import session as session_module
-from carlab.experiment.episodes.session import Session, SessionHooks, wait_until_still
+from carlab.experiment.episodes.hooks import RunHooks
+from carlab.experiment.episodes.session import Session, wait_until_still
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.recorder import Recorder
 from carlab.recording.run_folder import RunDirectory
@@ -52,7 +53,7 @@ def make_session(
     car: SimulatedCar,
     policy: Any,
     folder: Path,
-    hooks: SessionHooks | None = None,
+    hooks: RunHooks | None = None,
     envelope: SafetyEnvelope | None = None,
     **options: Any,
 ) -> Session:
@@ -63,7 +64,7 @@ def make_session(
         SafetyEnvelope() if envelope is None else envelope,
         RunDirectory.create(folder, "test"),
         1 / 30,
-        hooks=SessionHooks() if hooks is None else hooks,
+        hooks=RunHooks() if hooks is None else hooks,
         record_rerun=False,
         **options,
     )
@@ -76,7 +77,7 @@ def test_car_stands_still_at_the_start_of_each_episode(tmp_path: Path, by_hand: 
         if by_hand:
             car.place = lambda state: False  # type: ignore[method-assign]
         session = make_session(
-            car, Forward(), tmp_path, SessionHooks(place_by_hand=placed_by_hand.append), place=by_hand, max_ticks=30
+            car, Forward(), tmp_path, RunHooks(place_by_hand=placed_by_hand.append), place=by_hand, max_ticks=30
         )
         results = session.drive(3)
     assert [r.reason for r in results] == [EndReason.COMPLETED] * 3
@@ -102,7 +103,7 @@ def test_signal_during_placement_by_hand_ends_the_session_at_once(tmp_path: Path
 
     with ArmSpeedCar() as car:
         car.place = lambda state: False  # type: ignore[method-assign]
-        assert make_session(car, Forward(), tmp_path, SessionHooks(place_by_hand=place)).drive(3) == []
+        assert make_session(car, Forward(), tmp_path, RunHooks(place_by_hand=place)).drive(3) == []
     assert car.armed_at_mps == []
 
 
@@ -150,7 +151,7 @@ def test_hung_loop_that_resumes_does_not_end_the_episode_twice(
         hung.set()
 
     with SlowlyStoppingCar(clock=MonotonicClock()) as car:
-        session = make_session(car, HangingPolicy(), tmp_path, SessionHooks(on_abandon=on_abandon), hang_timeout_s=0.4)
+        session = make_session(car, HangingPolicy(), tmp_path, RunHooks(on_abandon=on_abandon), hang_timeout_s=0.4)
         if after_the_end:
             run_episode = session_module.run_episode
 
@@ -187,7 +188,7 @@ def test_slow_policy_of_a_car_in_simulated_time_is_no_hanging_loop(tmp_path: Pat
 
     abandoned: list[EndReason] = []
     with SimulatedCar() as car:
-        hooks = SessionHooks(on_abandon=lambda reason, detail: abandoned.append(reason))
+        hooks = RunHooks(on_abandon=lambda reason, detail: abandoned.append(reason))
         session = make_session(car, SlowPolicy(), tmp_path, hooks, hang_timeout_s=0.1, max_ticks=5)
         (result,) = session.drive(1)
     assert result.reason is EndReason.COMPLETED
@@ -204,7 +205,7 @@ def test_loop_that_resumes_after_the_car_was_closed_raises_where_it_hung(tmp_pat
             return super().act(view)
 
     with SimulatedCar(clock=MonotonicClock()) as car:
-        hooks = SessionHooks(on_abandon=lambda reason, detail: abandoned.set())
+        hooks = RunHooks(on_abandon=lambda reason, detail: abandoned.set())
         slow_guard = SafetyEnvelope(lost_pose_s=2.0)  # on a busy machine, the pose is older than 0.5 s after the hang
         session = make_session(car, HangingPolicy(), tmp_path, hooks, hang_timeout_s=0.4, envelope=slow_guard)
         with pytest.raises(SafetyStop, match="The loop hung while inside the policy 'forward'") as raised:
@@ -240,8 +241,8 @@ def test_no_episode_follows_a_requested_stop(tmp_path: Path, reason: EndReason, 
             return None if view.step == 10 else super().act(view)
 
     with ArmSpeedCar() as car:
-        hooks = SessionHooks(on_tick=lambda tick: ticks.append(tick.step), stop_reason=stop_reason)
-        results = make_session(car, ShortPolicy(), tmp_path, hooks).drive(3)
+        hooks = RunHooks(on_tick=lambda tick: ticks.append(tick.step))
+        results = make_session(car, ShortPolicy(), tmp_path, hooks, stop_reason=stop_reason).drive(3)
     assert [r.reason for r in results] == [reason] * episodes
     assert len(car.armed_at_mps) == episodes
     if reason is not EndReason.POLICY_FINISHED:

@@ -17,7 +17,7 @@ from carlab.experiment.campaign.campaign import Campaign
 from carlab.experiment.campaign.figures import figures_of
 from carlab.experiment.campaign.report import learning_curve, restore_missing_rows
 from carlab.experiment.campaign.training import training_figures
-from carlab.experiment.episodes.session import result_of
+from carlab.experiment.episodes.result import result_of
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
 

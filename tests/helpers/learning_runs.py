@@ -16,7 +16,8 @@ from carlab.core.task import ParkingTask
 from carlab.experiment.campaign.campaign import prior_simulator
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.training_plan import TrainingPlan
-from carlab.experiment.episodes.session import EpisodeResult, Session
+from carlab.experiment.episodes.result import EpisodeResult
+from carlab.experiment.episodes.session import Session
 from carlab.recording.run_folder import RunDirectory
 
 HISTORY = 2

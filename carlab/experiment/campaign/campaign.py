@@ -28,7 +28,8 @@ from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.seeds import MAX_SEED
 from carlab.core.toml_files import toml_tables
-from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
+from carlab.experiment.campaign.figures import figures_of
+from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.campaign.prior_correction import PriorVersion, corrected, without_ranges
 from carlab.experiment.campaign.prior_correction_process import (
     CorrectionRequest,
@@ -36,11 +37,12 @@ from carlab.experiment.campaign.prior_correction_process import (
     read_version,
     run_correction_subprocess,
 )
-from carlab.experiment.campaign.quick_check import EpisodeCheck, check_path, run_check_subprocess
-from carlab.experiment.campaign.training import Progress, model_folder, training_figures
+from carlab.experiment.campaign.quick_check import check_path, run_check_subprocess
+from carlab.experiment.campaign.training import model_folder, training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
-from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
+from carlab.experiment.episodes.result import EpisodeResult
+from carlab.experiment.episodes.session import Session
 from carlab.recording.mcap.source import has_ticks, read_documents
 from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent, SacSettings
@@ -102,21 +104,6 @@ def check_period(prior: SimulatorConfig, period_s: float, of: str) -> None:
 
 
 @dataclass(slots=True)
-class CampaignHooks:
-    """Callbacks of a campaign."""
-
-    session: SessionHooks = field(default_factory=SessionHooks)
-    on_training: Progress = lambda what, done, total: None
-    on_learned: Callable[[dict[str, Any]], None] = lambda figures: None
-    on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
-    on_checking: Callable[[], None] = lambda: None
-    on_check: Callable[[EpisodeCheck], None] = lambda check: None
-    on_correcting: Callable[[], None] = lambda: None
-    on_prior: Callable[[PriorVersion], None] = lambda version: None
-    stop: Callable[[], bool] = lambda: False
-
-
-@dataclass(slots=True)
 class Campaign:
     """A run of ``carlab learn`` on an open car.
 
@@ -130,7 +117,7 @@ class Campaign:
     plan: TrainingPlan
     episodes: int
     run: RunDirectory
-    hooks: CampaignHooks = field(default_factory=CampaignHooks)
+    hooks: LearnHooks = field(default_factory=LearnHooks)
     max_ticks: int | None = None
     place: bool = True
     record_rerun: bool = True
@@ -139,6 +126,7 @@ class Campaign:
     corrects_prior: bool = False
     correct: Callable[[CorrectionRequest, Callable[[], bool]], PriorVersion | None] = run_correction_subprocess
     trainer: Trainer | None = None
+    stop: Callable[[], bool] = lambda: False
 
     def write_plan(self) -> None:
         """Write the settings that resuming the run needs."""
@@ -170,12 +158,12 @@ class Campaign:
                     self.run.recordings(),
                     self._envelope,
                     self.hooks.on_training,
-                    self.hooks.stop,
+                    self.stop,
                 )
                 if trained is None:
                     return
                 self.hooks.on_learned(trained)
-            if self.hooks.stop():
+            if self.stop():
                 return
             training = training_figures(self.run, done + 1)
             result = self._drive(done + 1)
@@ -213,13 +201,13 @@ class Campaign:
         path = check_path(self.run, number)
         if not number or not path.parent.is_dir() or path.is_file() or not has_ticks(recordings[-1]):
             return
-        if self.hooks.stop():
+        if self.stop():
             return
         self.hooks.on_checking()
         simulator = self.checked_simulator or self.choice.simulator
         if self.corrects_prior:
             simulator = without_ranges(self._simulator(self._version(number - 1)))
-        check = run_check_subprocess(self.run, simulator, self.hooks.stop)
+        check = run_check_subprocess(self.run, simulator, self.stop)
         if check is not None:
             self.hooks.on_check(check)
 
@@ -251,12 +239,12 @@ class Campaign:
         number = len(self.run.recordings())
         path = correction_path(self.run, number)
         if not self.corrects_prior or not number or path.is_file() or not check_path(self.run, number).is_file():
-            return not self.hooks.stop()
+            return not self.stop()
         self.hooks.on_correcting()
         request = CorrectionRequest(
             tuple(self.run.recordings()), self.plan.prior_toml, self._version(number - 1), path.parent
         )
-        version = self.correct(request, self.hooks.stop)
+        version = self.correct(request, self.stop)
         if version is not None:
             self.hooks.on_prior(version)
         return version is not None
@@ -287,7 +275,7 @@ class Campaign:
             max_ticks=self.max_ticks,
             config_toml=self.choice.config_toml,
             metadata={"model": str(number), "method": self.plan.method},
-            hooks=self.hooks.session,
+            hooks=self.hooks,
             place=self.place,
             record_rerun=self.record_rerun,
         )
@@ -355,7 +343,7 @@ def saved_plan(folder: Path) -> TrainingPlan:
         ) from error
 
 
-def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:
+def resumed_campaign(run: RunDirectory, choice: CarChoice, device: str | None = None) -> Campaign:
     """Resume a run with its saved settings, optionally on another device. Raises DataError if it is not a campaign."""
     path = run.path / CAMPAIGN_FILE
     try:
@@ -366,7 +354,7 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
         tables = content.get("questioned")
         checked_simulator = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(
-            choice, plan, _checked_value(content, "episodes", int), run, hooks,
+            choice, plan, _checked_value(content, "episodes", int), run, LearnHooks(),
             None if content["ticks"] is None else _checked_value(content, "ticks", int),
             _checked_value(content, "place", bool), _checked_value(content, "rerun", bool),
             checked_simulator, str(content.get("car", "")), bool(content.get("repairs_prior", False)),

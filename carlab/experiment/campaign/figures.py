@@ -18,7 +18,7 @@ from carlab.core.observation import decode_state
 from carlab.core.quantities import FloatArray
 from carlab.core.task import Task
 from carlab.experiment.campaign.quick_check import EpisodeCheck
-from carlab.experiment.episodes.session import EpisodeResult
+from carlab.experiment.episodes.result import EpisodeResult
 from carlab.prediction.learned import sample_paths
 from learning.world.car_dynamics import OneStep
 from learning.world.disturbance import RolloutModel, start_rollouts

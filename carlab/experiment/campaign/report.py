@@ -13,7 +13,7 @@ from carlab.experiment.campaign.quick_check import EpisodeCheck
 from carlab.experiment.campaign.run_recording import write_run_recording
 from carlab.experiment.campaign.training import training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan
-from carlab.experiment.episodes.session import result_of
+from carlab.experiment.episodes.result import result_of
 from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
 

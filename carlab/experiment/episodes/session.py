@@ -15,7 +15,6 @@ import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -24,14 +23,15 @@ from carlab.core.clock import SimulatedClock, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, PoseLostError, add_sentence
-from carlab.core.observation import episode_features
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy
 from carlab.core.quantities import CarState
 from carlab.core.safety import SafetyEnvelope, SafetyStop
 from carlab.core.task import Task
 from carlab.experiment.episodes.episode import EpisodeHooks, run_episode
+from carlab.experiment.episodes.hooks import RunHooks
 from carlab.experiment.episodes.interrupts import Interrupts, LoopWatch
+from carlab.experiment.episodes.result import EpisodeResult, result_of
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.recorder import Recorder
 from carlab.recording.rerun.sink import RerunSink
@@ -41,68 +41,12 @@ from carlab.recording.sink import LogLine
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeResult:
-    """A completed episode.
-
-    ``summary`` holds the task's figures; with a constraint also the sum of its cost, and the ticks with a cost.
-    """
-
-    episode: int
-    data: EpisodeData
-    reason: EndReason
-    summary: Mapping[str, float]
-    path: Path
-
-    @property
-    def total_reward(self) -> float:
-        """Sum of rewards."""
-        return float(np.sum(self.data.rewards))
-
-    @property
-    def has_recorded_ticks(self) -> bool:
-        """Whether the recording exists and has a complete tick; the safety gate can end an episode before its first."""
-        return self.data.ticks > 0 and self.path.exists()
-
-
-def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
-    """Result of a recorded episode. Raises ConfigError if the task cannot evaluate it."""
-    try:
-        summary = {name: float(value) for name, value in task.summary(data.times_s, data.states).items()}
-        if task.has_constraint:
-            costs = np.asarray(task.cost(episode_features(data.states, data.sent, task.history_length)[1:]))
-            summary |= {"cost": float(costs.sum()), "violations": float((costs > 0.0).sum())}
-    except (Exception, SystemExit) as error:
-        raise ConfigError(
-            f"The task {task.name} cannot evaluate {path} ({type(error).__name__}: {error}); correct its summary and "
-            "cost; the recording is complete."
-        ) from error
-    return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], summary, path)
-
-
-@dataclass(slots=True)
-class SessionHooks:
-    """Callbacks of a session.
-
-    ``place_by_hand`` is called if the car cannot move to its start pose by itself; it returns when the car is there.
-    ``on_tick`` receives each tick, for a progress bar. ``on_document`` receives each document in the control loop, and
-    returns at once. ``stop_reason`` may end an episode (dead-man control).
-    ``on_abandon`` is called last if the loop hung, with reason and detail; it may end the process. Otherwise, if the
-    loop resumes, the episode ends with LOOP_HUNG, or the session raises SafetyStop with them if the loop fails.
-    """
-
-    place_by_hand: Callable[[CarState], None] = lambda start: None
-    on_episode: Callable[[int, int], None] = lambda episode, ticks: None
-    on_tick: Callable[[Tick], None] = lambda tick: None
-    on_document: Callable[[Document], None] = lambda document: None
-    on_result: Callable[[EpisodeResult], None] = lambda result: None
-    stop_reason: Callable[[], EndReason | None] = lambda: None
-    on_abandon: Callable[[EndReason, str], None] = lambda reason, detail: None
-
-
 @dataclass(slots=True)
 class Session:
-    """Drives ``episodes`` of a task with a policy on an open car into a run directory."""
+    """Drives ``episodes`` of a task with a policy on an open car into a run directory.
+
+    ``stop_reason`` may end an episode (dead-man control).
+    """
 
     car: Car
     policy: Policy
@@ -114,7 +58,8 @@ class Session:
     max_ticks: int | None = None
     config_toml: str = ""
     metadata: Mapping[str, str] = field(default_factory=dict)
-    hooks: SessionHooks = field(default_factory=SessionHooks)
+    hooks: RunHooks = field(default_factory=RunHooks)
+    stop_reason: Callable[[], EndReason | None] = lambda: None
     hang_timeout_s: float = 2.0
     place: bool = True
     record_rerun: bool = True
@@ -160,7 +105,7 @@ class Session:
         watch = LoopWatch(abandon, timeout_s=timeout_s, urgent=interrupts.urgent)
         hooks = EpisodeHooks(
             emit=emitter.emit,
-            stop_requested=lambda: interrupts.reason() or self.hooks.stop_reason(),
+            stop_requested=lambda: interrupts.reason() or self.stop_reason(),
             recorder_failed=lambda: recorder.failed,
             heartbeat=watch.beat,
         )
@@ -219,7 +164,7 @@ class _Emitter:
     end by the watchdog thread.
     """
 
-    def __init__(self, recorder: Recorder, hooks: SessionHooks) -> None:
+    def __init__(self, recorder: Recorder, hooks: RunHooks) -> None:
         self._recorder, self._hooks = recorder, hooks
         self._lock = threading.Lock()
         self._ended = False
