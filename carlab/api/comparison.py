@@ -34,8 +34,9 @@ def compare(
     Args:
         recordings: first group: recordings, episodes, or paths of MCAP or CSV files or of run folders.
         changed: second group.
-        car: the simulator, best the model of a diagnosis: a car file, its path, or a name.
-        candidates: effects and base parameters that may differ; all by default.
+        car: simulator of the car: a car file (preferably the model of a diagnosis), its path, or a name: ``sim`` (the
+            default car) or a preset (``eth_rc_car`` ...).
+        candidates: restrict the changes to these effects and base parameters (``motor.drive_gain`` ...).
         out: folder for compare.json (schema ``carlab.compare/1``); nothing is written by default.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the changes so far are the result.

@@ -136,41 +136,40 @@ class DiagnosisReport:
 
 
 def diagnose(
-    recordings: RecordingLike | Iterable[RecordingLike],
-    car: str | Path | CarFile = "sim",
-    *,
-    held_out: RecordingLike | Iterable[RecordingLike] = (),
-    holdout_share: float | None = None,
-    effects: Sequence[str] = (),
-    curves: bool = False,
-    ceiling: bool = False,
-    discrepancy: bool = False,
-    adapt: bool = False,
-    keep_events: bool = False,
-    seed: int = 0,
-    jobs: int | None = None,
-    budget_s: float = 300.0,
-    out: Path | str | None = None,
-    progress: Callable[[str, float], None] = lambda activity, share: None,
+    recordings: RecordingLike | Iterable[RecordingLike], car: str | Path | CarFile = "sim", *,
+    held_out: RecordingLike | Iterable[RecordingLike] = (), holdout_share: float | None = None,
+    effects: Sequence[str] = (), curves: bool = False, ceiling: bool = False, discrepancy: bool = False,
+    adapt: bool = False, keep_events: bool = False, seed: int = 0, jobs: int | None = None, budget_s: float = 300.0,
+    out: Path | str | None = None, progress: Callable[[str, float], None] = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
-) -> DiagnosisReport:
+) -> DiagnosisReport:  # fmt: skip
     """Identify physics that recordings show and a simulator lacks, and validate it on held-out recordings.
 
     Args:
-        recordings: one recording or several, to fit: a ``Recording``, an ``EpisodeData``, a path (MCAP, CSV), or a
-            run folder, of which every third episode is held out.
-        car: the simulator to check: a car file, its path, or a name (``sim``, ``eth_rc_car`` ...).
-        held_out: held-out recordings, which no fit uses; by default the last part of each recording is held out.
-        holdout_share: length of that part as a share of the recording, above 0 and at most 0.5; 0.3 by default.
+        recordings: one recording or several, to fit: a ``Recording``, an ``EpisodeData``, a path (MCAP, CSV), or a run
+            folder, of which every third episode is held out.
+        car: simulator to diagnose: a car file, its path, or a name: ``sim`` (the default car) or a preset
+            (``eth_rc_car``, ``dart_jetracer`` ...).
+        held_out: held-out recordings: no fit uses them. By default the last part of each recording is held out.
+        holdout_share: length of the held-out last part as a share of the recording, above 0 and at most 0.5; 0.3 by
+            default.
         effects: restrict the search to these effects of the catalogue.
-        curves: fit measured curves if named effects leave more than a tenth of the squared excess; takes minutes.
-        ceiling: train a black box, to show how much of the error can be predicted at all; takes minutes.
-        discrepancy: train networks that correct the diagnosed simulator, and report their error; takes minutes.
-        adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
-        keep_events: also fit and score windows with events (collisions, a hand); the report lists them in any case.
+        curves: fit measured curves (drive force, steering, tyres) if the named effects leave more than a tenth of the
+            refit's squared excess (error above the noise floor); takes minutes.
+        ceiling: train a black box (networks without a simulator), to show how much of the error can be predicted at
+            all. Needs 60 s of driving; takes minutes.
+        discrepancy: train networks that correct the accelerations of the diagnosed simulator, and report their error.
+            Needs 60 s of driving; takes minutes.
+        adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car since the
+            fitted recordings; takes a minute.
+        keep_events: also fit and score prediction windows with events (collisions, a hand that moves the car). By
+            default they are listed and left out.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
-        jobs: number of processes, with equal results; by default one, or all cores from two minutes of recordings on.
-        budget_s: time limit [s] without curves, networks and adaptation, ``inf`` for none; the search ends at 60 %.
+        jobs: number of processes that share the fits; the result is the same for each number. By default one for short
+            recordings, and one for each core for recordings of two minutes or more.
+        budget_s: time limit [s] of the diagnosis without measured curves, networks and adaptation; ``inf``: no limit.
+            The search for effects ends at 60 % of the limit. The report then has the effects found so far and says that
+            the search was cut short. The checks after such a search can exceed the limit.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.

@@ -48,7 +48,7 @@ EXCITATION, EXCITATION_S = "excitation", 60.0
 def drive(
     car: str | Path | CarFile = "sim", *, policy: str | Path | Policy = "parking", task: str | Task | None = None,
     track: Path | str | None = None, episodes: int = 1, ticks: int | None = None, seed: int = 0,
-    max_throttle: float | None = None, place: bool = True, out: Path | str = "runs", name: str = "drive",
+    max_throttle: float | None = None, place: bool = True, out: Path | str = Path("runs"), name: str = "drive",
     rerun: bool = True, picture: bool = True, live: bool = False, viewer: str | None = None,
     vehicle: str | Path | CarFile | None = None, reality: str | Path | CarFile | None = None, dry_run: bool = False,
     hooks: RunHooks | None = None,
@@ -56,26 +56,29 @@ def drive(
     """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
 
     Args:
-        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
+        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset (``eth_rc_car``, ``dart_jetracer`` ...:
+            simulated), or a car file: a real car with ``[hardware]``, else a simulated car.
         policy: ``parking`` (feedback), ``excitation`` (random commands), a manoeuvre, ``neutral``, ``keyboard``,
             ``gamepad``, folder of a ``carlab.learn`` run or of its model, or a ``carlab.core.policy.Policy``.
         task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
             Without it, a manoeuvre of a simulated or emulated car has no arena.
-        track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
+        track: CSV file for ``laps``: x, y (centre line in driving direction), width [m]; default: the car's, or an
+            oval.
         episodes: number of episodes.
-        ticks: control periods per episode; by default the task's number, a whole manoeuvre, a minute of ``excitation``,
-            or for ``keyboard`` and ``gamepad`` no limit.
-        seed: of start poses, sensor noise and the commands of ``excitation``.
+        ticks: control periods (ticks) per episode; by default the task's number (parking: 100 at 30 Hz), a whole
+            manoeuvre, a minute of ``excitation``, or for ``keyboard`` and ``gamepad`` no limit.
+        seed: seed of start poses, sensor noise and the commands of ``excitation``.
         max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
-        place: start each episode at the task's start pose; False: at the car's current pose.
+        place: start each episode at the task's start pose; otherwise at the car's current pose.
         out: parent of the run's folder, whose result.json is written after each episode.
         name: last part of the run folder's name.
         rerun: also record .rrd files.
         picture: draw summary.png.
-        live: open the rerun viewer, which follows the run.
-        viewer: address of an open viewer that follows the run, ``rerun+http://HOST:9876/proxy``.
-        vehicle: car file that replaces the default car of ``sim`` and ``emulated``.
-        reality: car file with the true physics of a simulated or emulated car. Learning and diagnosis do not read it.
+        live: open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it.
+        viewer: address of an open rerun viewer that follows the run, on any computer: ``rerun+http://HOST:9876/proxy``.
+        vehicle: car file with physics and motion capture of ``sim`` and ``emulated``, which replaces the default car.
+        reality: car file with the true physics of a simulated or emulated car, unlike the file of ``car`` or
+            ``vehicle``. Learning and diagnosis do not read it; they see the difference only in recordings.
         dry_run: measure and compute commands, but send none to the car.
         hooks: callbacks.
 
@@ -87,6 +90,7 @@ def drive(
         NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control loop hung.
     """
     from carlab.cars import choose_car
+    from carlab.experiment.campaign.live_view import LiveSettings, LiveView
 
     hooks = hooks or RunHooks()
     _check(policy, max_throttle, episodes=episodes, ticks=ticks, seed=seed)
@@ -94,16 +98,12 @@ def drive(
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
     driver, chosen_task = _policy_and_task(policy, task, track, choice)
-    with contextlib.ExitStack() as stack:
-        run = stack.enter_context(new_run(out, name, choice, hooks))
+    with new_run(out, name, choice, hooks) as run, contextlib.ExitStack() as stack:
         if connect is not None:
-            from carlab.experiment.campaign.live_view import LiveSettings, LiveView
-
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
         with run_results(run, picture) as results:
-            hooks = collecting(hooks, run, results)
-            _drive(choice, driver, chosen_task, max_throttle, run, episodes, hooks, options)
+            _drive(choice, driver, chosen_task, max_throttle, run, episodes, collecting(hooks, run, results), options)
     return DriveRun(run.path, tuple(results))
 
 
@@ -113,7 +113,7 @@ def replay(
     *,
     seconds: float | None = None,
     seed: int = 0,
-    out: Path | str = "runs",
+    out: Path | str = Path("runs"),
     vehicle: str | Path | CarFile | None = None,
     reality: str | Path | CarFile | None = None,
     dry_run: bool = False,
@@ -124,8 +124,8 @@ def replay(
     Args:
         recording: an MCAP or CSV file, or a loaded recording, whose longest episode is replayed; or an episode.
         car: as for ``drive``. The arena of an emulated or simulated car extends 20 m beyond the recording by default.
-        seconds: duration of the replay [s]; by default the whole recording.
-        seed: of sensor noise.
+        seconds: length of the first part of the recording that is driven [s]; by default the whole recording.
+        seed: seed of the sensor noise.
         out: parent of the run's folder.
         vehicle: as for ``drive``.
         reality: as for ``drive``.

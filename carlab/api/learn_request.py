@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.cars import car_name, car_options_text
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
+from carlab.core.method_names import current_method
 from carlab.experiment.cluster.settings import LinkSettings
 
 if TYPE_CHECKING:
@@ -62,6 +64,13 @@ class LearnRequest:
     def car_options(self) -> str:
         """Command-line options that select the car."""
         return car_options_text(self.car, self.vehicle, self.reality, self.dry_run)
+
+
+def learn_request(given: dict[str, Any]) -> LearnRequest:
+    """The request with the arguments that the caller gives."""
+    kinds: dict[str, Callable[[Any], Any]] = {"resume": Path, "method": current_method}
+    converted = {name: kind(given[name]) for name, kind in kinds.items() if name in given}
+    return LearnRequest(**given | converted, given=frozenset(given))
 
 
 def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from carlab.api.arguments import above_zero, at_least, at_most, valid_seed, whole_number
-from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
+from carlab.api.learn_request import (
+    AUTO,
+    RAY_WAIT_S,
+    Device,
+    LearnRequest,
+    Method,
+    checked_simulator,
+    learn_request,
+    training_plan,
+)
 from carlab.api.runs import (
     check_learning_run,
     existing_run,
@@ -24,7 +33,6 @@ from carlab.api.runs import (
 )
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
-from carlab.core.method_names import current_method
 from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
@@ -121,27 +129,35 @@ def learn(
         task: as for ``carlab.drive``; by default that of the resumed run, else ``parking``.
         track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
-        ticks: control periods per episode; by default the task's number.
+        ticks: control periods (ticks) per episode, more than ``history``; by default the task's number.
         prior: the prior simulator: ``kinematic`` (the default), ``nominal``, or a car file such as a diagnosed model.
             ``auto`` starts with the nominal one; between episodes, effects and parameters that the recordings support
             are added to it, and those that the recordings contradict are removed.
-        method: ``gp-sim-posterior`` (the default); ``gp-posterior`` without a simulator; ``sim-fsvgd``,
-            ``sim-fsvgd-corrected`` and ``fsvgd`` are the paper's algorithms with its settings.
-        history: number of past commands that model and policy observe; by default it covers the car's delays.
-        model_steps: optimiser steps of the model before each episode; 2500 by default.
-        updates: SAC gradient steps; 30 000 by default. 1.5 times as many before episode 1, 3 / episode after episode 3.
-        seed: of all random numbers; 0 by default.
-        device: of the training of model and policy; ``cpu`` by default.
-        place: True, the default: start each episode at the task's start pose; False: at the car's current pose.
-        resume: folder of a run to resume; only ``episodes``, ``device``, ``ray``, ``live`` and ``viewer`` may change.
+        method: ``gp-sim-posterior`` (the default): particles of a Gaussian-process posterior around the simulator
+            (carlab's own method). ``gp-posterior``: the same without a simulator. ``sim-fsvgd``: the paper's, as in the
+            authors' code; ``sim-fsvgd-corrected``: without its errors; ``fsvgd``: the paper's, without a simulator.
+        history: number of past commands that model and policy observe. By default it covers the command delay, the
+            latency of motion capture and the window of the velocity estimate (4 for the simulated car; the paper's
+            methods have 3). After three episodes a message states the number that the recordings support.
+        model_steps: optimiser steps of the model before an episode, 2500 by default (the paper's methods: up to 40
+            000).
+        updates: gradient steps of SAC before an episode, 30 000 by default. Before the first episode the number is 1.5
+            times as large; after the third it is multiplied by 3 / episode.
+        seed: seed of all random numbers, 0 by default. The same seed gives the same run, except for a resumed run (its
+            times have other rounding errors) and a run with the prior ``auto`` (its diagnoses have a time limit).
+        device: device of the training: by default ``cpu``, or that of the resumed run. The policy drives on the CPU.
+        place: start each episode at the task's start pose, at which a person places a real car (the default); otherwise
+            at the car's current pose.
+        resume: folder of a run to resume. The car must be the same; ``episodes``, ``device``, ``ray``, ``live`` and
+            ``viewer`` may change, and all other arguments are those of the run.
         out: parent of the folder of a new run; ``runs`` by default.
         name: last part of the name of this folder; ``learn`` by default.
-        rerun: True, the default: also record .rrd files.
+        rerun: also record .rrd files (the default).
         live: as for ``carlab.drive``.
         viewer: as for ``carlab.drive``.
         vehicle: as for ``carlab.drive``.
         reality: as for ``carlab.drive``.
-        dry_run: measure and compute commands, but send none to the car.
+        dry_run: as for ``carlab.drive``.
         ray: train on Ray: ``local``, or the address of a cluster; empty: a child process. The car stays here.
         ray_wait: time without an answer of the cluster after which a training runs on this computer [s].
         hooks: callbacks: ``carlab.LearnHooks``, or ``carlab.RunHooks``.
@@ -154,12 +170,8 @@ def learn(
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
     given: dict[str, Any] = {name: value for name, value in locals().items() if value is not None and name != "hooks"}
-    if resume is not None:
-        given["resume"] = Path(resume)
-    if method is not None:
-        given["method"] = current_method(method)
     callbacks = {f.name: getattr(hooks, f.name) for f in fields(LearnHooks) if hasattr(hooks, f.name)}
-    return _learn(LearnRequest(**given, given=frozenset(given)), LearnHooks(**callbacks))
+    return _learn(learn_request(given), LearnHooks(**callbacks))
 
 
 @dataclass(slots=True)

@@ -151,10 +151,12 @@ def predict(
         recording: one recording or several: a ``Recording``, an ``EpisodeData``, or the path of an MCAP or a CSV.
         car: the simulator: a car file, its path, or a name.
         horizon_s: prediction horizon [s].
-        stride_s: time between initial states [s].
-        holdout_share: share of the last part of the recording, above 0 and at most 0.5.
-        adapt: also predict with adaptation to the recent past: rows before each initial state.
-        keep_events: score windows with events (collisions) too.
+        stride_s: time between the starts of two predictions [s].
+        holdout_share: length of the last part as a share of the recording, above 0 and at most 0.5.
+        adapt: also predict with adaptation: drive force, steering trim, grip and force forward are estimated from the
+            rows before each prediction.
+        keep_events: also score prediction windows with events (collisions, a hand that moves the car). By default they
+            are listed and left out.
 
     Returns:
         The errors of the model, with and without adaptation, of constant velocity and of no change. For a model of a

@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 from rich.text import Text
 from tyro.conf import OmitArgPrefixes
 
+from carlab.api import check
 from carlab.cli.console import banner, console, fail, readings_table, table
-from carlab.cli.options import CarOptions, TaskOptions, arguments_of
+from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.core.errors import NotReadyError
 from carlab.experiment.episodes.hooks import RunHooks
 
 
 @dataclass
+@options_of(check)
 class Check:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
@@ -28,19 +30,14 @@ class Check:
 
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    seconds: float = 2.0
-    """Duration of the motion-capture measurement [s]."""
-
-    wheels: bool = True
-    """On an emulated car, also steer at rest to measure the latency of a command; a real car does not move."""
+    seconds: float = OF_CALL
+    wheels: bool = OF_CALL
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
         """Check and print."""
-        from carlab.api import check
-
         hooks = RunHooks(on_start=lambda folder, car: banner(car.reality, car.name, moves=False))
         result = check(**arguments_of(self, check), hooks=hooks)
         if self.task.to_text():

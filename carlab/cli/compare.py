@@ -8,13 +8,15 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from carlab.api import compare
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
-from carlab.cli.options import arguments_of, report_folder
+from carlab.cli.options import OF_CALL, arguments_of, options_of, report_folder
 from carlab.cli.runs import search_callbacks
 
 
 @dataclass
+@options_of(compare)
 class Compare:
     """Find what changed between two groups of drives of one car: another day, battery, floor, tyre or set-up.
 
@@ -30,12 +32,8 @@ class Compare:
     changed: Annotated[tuple[Path, ...], arg(name="with")] = ()
     """Recordings of the second group."""
 
-    car: str = "sim"
-    """Simulator of the car: a car file (preferably model.toml of a diagnosis), a preset (eth_rc_car ...), or sim (the
-    default car)."""
-
-    candidates: tuple[str, ...] = ()
-    """Restrict the changes to these effects and base parameters (motor.drive_gain ...)."""
+    car: str = OF_CALL
+    candidates: tuple[str, ...] = OF_CALL
 
     out: Path = Path("comparison")
     """Folder for compare.json; an earlier compare.json in it is replaced."""
@@ -45,8 +43,6 @@ class Compare:
 
     def run(self) -> int:
         """Compare and print the changes."""
-        from carlab.api import compare
-
         report_folder(self.out)
         with search_callbacks("comparison") as callbacks:
             found = compare(**arguments_of(self, compare), **callbacks)

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
+from carlab.api import drive
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import CarOptions, TaskOptions, arguments_of
+from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
 from carlab.experiment.episodes.hooks import RunHooks
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
+@options_of(drive)
 class Drive:
     """Drive episodes with a policy, a scripted manoeuvre or a gamepad on a car, and record them.
 
@@ -35,53 +37,29 @@ class Drive:
 
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    policy: str = "parking"
+    policy: str = OF_CALL
     """parking (feedback), excitation (random commands inside the arena, for a diagnosis), neutral (no motion), keyboard
     or gamepad (hold the dead-man control), a scripted manoeuvre (steering_steps, throttle_steps, steering_chirp,
     figure_eight, throttle_ramp, coast_down, slow_circle), or the run folder of carlab learn: its newest policy
     (RUN/models/0003: the policy of episode 3)."""
 
-    episodes: int = 1
-    """Number of episodes."""
-
-    ticks: int | None = None
-    """Ticks per episode. By default the task's number (parking: 100 at 30 Hz); for a scripted manoeuvre its duration;
-    for excitation a minute; with keyboard or gamepad no limit."""
-
-    seed: int = 0
-    """Seed of start poses, sensor noise, and the commands of excitation."""
-
-    max_throttle: float | None = None
-    """Upper limit of the throttle in the safety gate, in (0, 1]."""
-
-    place: bool = True
-    """Start each episode at the task's start pose; off: at the car's current pose."""
-
-    out: Path = Path("runs")
-    """Parent of the run's folder."""
-
-    name: str = "drive"
-    """Last part of the run folder's name."""
-
-    rerun: bool = True
-    """Also record .rrd files."""
-
-    live: bool = False
-    """Open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it."""
-
-    viewer: str | None = None
-    """Address of an open rerun viewer, also on another computer, that follows the run: rerun+http://HOST:9876/proxy."""
-
-    picture: bool = True
-    """Draw summary.png."""
+    episodes: int = OF_CALL
+    ticks: int | None = OF_CALL
+    seed: int = OF_CALL
+    max_throttle: float | None = OF_CALL
+    place: bool = OF_CALL
+    out: Path = OF_CALL
+    name: str = OF_CALL
+    rerun: bool = OF_CALL
+    live: bool = OF_CALL
+    viewer: str | None = OF_CALL
+    picture: bool = OF_CALL
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
         """Drive and print the results."""
-        from carlab.api import drive
-
         with progress() as bar:
             run = drive(**arguments_of(self, drive), hooks=self._hooks(bar))
         return self._report(run)

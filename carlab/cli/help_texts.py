@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable
-from dataclasses import is_dataclass, replace
+from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
@@ -28,16 +29,41 @@ def improve_help(option_classes: Iterable[type]) -> None:
 def _join_lines(option_class: type) -> None:
     """Join the lines of each option's help text, so that tyro wraps the text at the width of the terminal.
 
-    tyro keeps the line breaks of attribute docstrings, but not those of an ``Args`` section in the docstring of a
-    class. Therefore this function copies the attribute docstrings into such a section.
+    The text is the attribute docstring, or that of the argument of the call (``carlab.cli.options.options_of``). tyro
+    keeps the line breaks of attribute docstrings, but not those of an ``Args`` section in the docstring of a class.
+    Therefore this function copies the texts into such a section.
     """
     from docstring_parser.attrdoc import AttributeDocstrings
 
     summary = inspect.getdoc(option_class) or ""
-    texts = AttributeDocstrings().get_attr_docs(option_class)
-    rows = [f"    {name}: {' '.join(text.split())}" for name, (text, *_) in texts.items() if text]
+    own = {name: text for name, (text, *_) in AttributeDocstrings().get_attr_docs(option_class).items() if text}
+    texts = _argument_texts(option_class) | own
+    rows = [f"    {name}: {' '.join(texts[name].split())}" for name in _option_names(option_class) if name in texts]
     if rows and MARK not in summary:
         option_class.__doc__ = summary + MARK + "\n".join(rows)
+
+
+def _option_names(option_class: type) -> list[str]:
+    """Names of the options of a class, without those of its groups of options."""
+    return [field.name for field in fields(option_class) if field.default_factory is MISSING]
+
+
+def _argument_texts(option_class: type) -> dict[str, str]:
+    """Texts of the arguments of the class's calls, with the names of options; "as for ..." counts as no text."""
+    from docstring_parser import parse
+
+    names = _option_names(option_class)
+
+    def as_option(match: re.Match[str]) -> str:
+        return f"--{match[1].replace('_', '-')}" if match[1] in names else match[1]
+
+    texts: dict[str, str] = {}
+    for call in getattr(option_class, "calls", ()):
+        for argument in parse(call.__doc__ or "").params:
+            text = argument.description or ""
+            if not text.startswith("as for "):
+                texts.setdefault(argument.arg_name, re.sub("``(.*?)``", as_option, text[:1].upper() + text[1:]))
+    return texts
 
 
 def _omit_empty_defaults(option_class: type) -> None:

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes, arg
 
+from carlab.api import drive, learn
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import CarOptions, TaskOptions, arguments_of
+from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
 from carlab.experiment.campaign.hooks import LearnHooks
 
@@ -51,6 +52,7 @@ def _print_figures(bar: Progress, row: EpisodeFigures) -> None:
 
 
 @dataclass
+@options_of(learn, drive)
 class Learn:
     """Fit a model of the car (the learned car), train a policy in it, drive an episode with the policy, and repeat.
 
@@ -64,84 +66,44 @@ class Learn:
 
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    episodes: int | None = None
-    """Total number of episodes, including those already driven; by default 20, or the number of the resumed run."""
+    episodes: int | None = OF_CALL
+    ticks: int | None = OF_CALL
 
-    ticks: int | None = None
-    """Ticks per episode, more than --history; by default the task's number (parking: 100 at 30 Hz)."""
-
-    prior: str | None = None
+    prior: str | None = OF_CALL
     """The prior simulator: kinematic (the default: the car file without wheel slip), nominal (the car file), auto, or
     FILE.toml (for example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and
     parameters that the recordings support are added to the prior, and those that they contradict are removed; the run
     prints each change. Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle
     lie within 30 % of their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
 
-    method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = None
-    """gp-sim-posterior (the default): particles fitted to a Gaussian-process posterior around the simulator (carlab's
-    own method). gp-posterior: the same without a simulator. sim-fsvgd: the paper's algorithm as in the authors' public
-    code, with the simulator prior; sim-fsvgd-corrected: without the errors of that code; fsvgd: the paper's, without a
-    simulator."""
+    method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = OF_CALL
+    history: int | None = OF_CALL
+    model_steps: int | None = OF_CALL
+    updates: int | None = OF_CALL
+    seed: int | None = OF_CALL
+    device: Device | None = OF_CALL
 
-    history: int | None = None
-    """Number of past commands that model and policy observe. By default it covers the command delay, the latency of
-    motion capture and the window of the velocity estimate (4 for the simulated car; the paper's methods have 3).
-    After three episodes the run prints the number that the recordings support."""
-
-    model_steps: int | None = None
-    """Steps of the model's optimiser before each episode: 2500 by default (the paper's methods: at most 40 000)."""
-
-    updates: int | None = None
-    """Gradient steps of SAC before an episode, 30 000 by default. Before the first episode the number is 1.5 times as
-    large; after the third it is multiplied by 3 / episode."""
-
-    seed: int | None = None
-    """Seed of all random numbers, 0 by default. The same seed gives the same run. Exceptions: a resumed run, whose
-    times have other rounding errors; with --prior auto a run after its first diagnosis, which has a time limit."""
-
-    device: Device | None = None
-    """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""
-
-    ray: str = ""
+    ray: str = OF_CALL
     """Train on Ray while the car stays with this computer: local, or the address of a cluster (ray://HOST:10001) with
     the same version of carlab, for example a computer with a GPU (--device cuda). While the cluster does not answer,
     the car stays in neutral and the run waits (--ray-wait). Then the run trains on this computer, and tries the cluster
     again before the next episode. Needs the extra ray of carlab (see "Run on a Ray
     cluster")."""
 
-    ray_wait: float = RAY_WAIT_S
-    """Time without an answer of the cluster after which a training runs on this computer [s]."""
-
-    place: bool | None = None
-    """Start each episode at the task's start pose, at which a person places a real car (the default); off: at the car's
-    current pose."""
-
-    resume: Path | None = None
-    """Run folder to resume. --car must be the same; --episodes, --device, --ray, --live and --viewer may change, and
-    all other options are those of the run."""
-
-    out: Path | None = None
-    """Parent of the folder of a new run; runs by default."""
-
-    name: str | None = None
-    """Last part of the name of this folder; learn by default."""
-
-    rerun: bool | None = None
-    """Also record .rrd files (the default)."""
-
-    live: bool = False
-    """Open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it."""
-
-    viewer: str | None = None
-    """Address of an open rerun viewer, also on another computer, that follows the run: rerun+http://HOST:9876/proxy."""
+    ray_wait: float = OF_CALL
+    place: bool | None = OF_CALL
+    resume: Path | None = OF_CALL
+    out: Path | None = OF_CALL
+    name: str | None = OF_CALL
+    rerun: bool | None = OF_CALL
+    live: bool = OF_CALL
+    viewer: str | None = OF_CALL
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
         """Learn and print the results."""
-        from carlab.api import learn
-
         with progress(speed_estimate_period_s=STEPS_PERIOD_S) as bar:
             run = learn(**arguments_of(self, learn), hooks=self._hooks(bar))
         return self._report(run)

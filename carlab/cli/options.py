@@ -9,32 +9,46 @@ from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
+from carlab.api import drive
 from carlab.api.cars import car_options_text
 from carlab.core.errors import ConfigError, DataError
+
+OF_CALL: Any = object()
+"""Default of an option that has the default of an argument, see ``options_of``."""
+T = TypeVar("T")
 
 if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry
 
 
+def options_of(*calls: Callable[..., Any]) -> Callable[[type[T]], type[T]]:
+    """Class decorator below ``@dataclass``: options are arguments of calls of the Python API.
+
+    An option whose value is ``OF_CALL`` has the default of the argument of its name. An option without a help text has
+    the text of that argument (``carlab.cli.help_texts``). The first call with that argument counts.
+    """
+
+    def with_defaults(option_class: type[T]) -> type[T]:
+        arguments = {name: p for call in reversed(calls) for name, p in inspect.signature(call).parameters.items()}
+        for name in [name for name, value in vars(option_class).items() if value is OF_CALL]:
+            setattr(option_class, name, arguments[name].default)
+        option_class.calls = calls  # type: ignore[attr-defined]
+        return option_class
+
+    return with_defaults
+
+
 @dataclass
+@options_of(drive)
 class CarOptions:
     """Options that select the car."""
 
-    car: str = "sim"
-    """sim, emulated (serial), emulated-can, a preset (eth_rc_car, dart_jetracer ...: simulated), or FILE.toml: a real
-    car with [hardware], else a simulated car."""
-
-    vehicle: Path | None = None
-    """Car file with physics and motion capture of sim and emulated, which replaces the default car."""
-
-    dry_run: bool = False
-    """Measure and compute commands, but send none to the car."""
-
-    reality: Path | None = None
-    """Car file with the true physics of a simulated or emulated car, which differ from the file of --car or --vehicle.
-    Learning and diagnosis do not read it; they see the difference only in recordings."""
+    car: str = OF_CALL
+    vehicle: Path | None = OF_CALL
+    dry_run: bool = OF_CALL
+    reality: Path | None = OF_CALL
 
     def to_text(self) -> str:
         """These options as command-line text, each with a leading space; default values are omitted."""
@@ -42,17 +56,16 @@ class CarOptions:
 
 
 @dataclass
+@options_of(drive)
 class TaskOptions:
     """Options that select the task."""
 
-    task: str | None = None
+    task: str | None = OF_CALL
     """parking, obstacles (parking behind four discs), path (figure eight), laps, or FILE.py:CLASS: a class in your own
     file, derived from carlab.core.task.Task. By default parking, or the task of a run that is resumed or driven again.
     A run folder contains no code, so a run with your own task needs FILE.py:CLASS again."""
 
-    track: Path | None = None
-    """CSV file with the columns x, y (centre line in driving direction) and width [m], for laps. By default [track] of
-    the car file, or an oval."""
+    track: Path | None = OF_CALL
 
     def to_text(self) -> str:
         """These options as command-line text, each with a leading space; default values are omitted."""

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from carlab.api import predict, replay
 from carlab.api.arguments import above_zero, valid_seed
 from carlab.api.recordings import load
 from carlab.cli.console import banner, console, fail, progress, table
-from carlab.cli.options import CarOptions, arguments_of, new_file
+from carlab.cli.options import OF_CALL, CarOptions, arguments_of, new_file, options_of
 from carlab.cli.recordings import print_errors, print_recording
 from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
+@options_of(predict, replay)
 class Replay:
     """Print the prediction errors of a simulator on a recording, or send the recorded actions to a car again.
 
@@ -40,22 +42,11 @@ class Replay:
 
     car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    horizon_s: Annotated[float, arg(name="horizon")] = 1.0
-    """Prediction horizon [s]."""
-
-    stride_s: Annotated[float, arg(name="stride")] = 0.25
-    """Time between the starts of two predictions [s]."""
-
-    holdout_share: float = 0.3
-    """Length of the last part as a share of the recording, above 0 and at most 0.5."""
-
-    adapt: bool = False
-    """Also predict with adaptation: drive force, steering trim, grip and force forward are estimated from the rows
-    before each prediction."""
-
-    keep_events: bool = False
-    """Also score prediction windows with events (collisions, a hand that moves the car). By default they are listed and
-    left out."""
+    horizon_s: Annotated[float, arg(name="horizon")] = OF_CALL
+    stride_s: Annotated[float, arg(name="stride")] = OF_CALL
+    holdout_share: float = OF_CALL
+    adapt: bool = OF_CALL
+    keep_events: bool = OF_CALL
 
     save: Path | None = None
     """Write FILE.rrd with the recording and the predictions."""
@@ -63,14 +54,9 @@ class Replay:
     drive: bool = False
     """Drive a simulated car too, instead of predicting."""
 
-    seconds: float | None = None
-    """Length of the first part of the recording that is driven [s]; by default the whole recording."""
-
-    seed: int = 0
-    """Seed of the sensor noise."""
-
-    out: Path = Path("runs")
-    """Parent of the folder with the new recording."""
+    seconds: float | None = OF_CALL
+    seed: int = OF_CALL
+    out: Path = OF_CALL
 
     verbose: bool = False
     """Show the whole log."""
@@ -99,7 +85,6 @@ class Replay:
         return 0
 
     def _predict(self) -> None:
-        from carlab.api import predict
         from carlab.diagnosis.report.events import event_sentences
         from carlab.diagnosis.score_recording import MODEL, describe_windows
 
@@ -154,7 +139,6 @@ class Replay:
         table(f"By channel, {found.score.whole.part}", columns, rows)
 
     def _drive(self) -> int:
-        from carlab.api import replay
         from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
         from carlab.core.outcome import EndReason
 

@@ -106,6 +106,6 @@ def test_second_interrupt_ends_a_search_at_once(
         signal.raise_signal(signal.SIGINT)
         pytest.fail("the search continued after the second ^C")
 
-    monkeypatch.setattr(f"carlab.api.{verb}", interrupted_twice)
+    monkeypatch.setattr(f"carlab.cli.{verb}.{verb}", interrupted_twice)
     other = ("--with", "b.csv") if verb == "compare" else ()
     assert carlab(verb, "a.csv", *other, "--out", tmp_path / "out") == (130, "carlab: Interrupted.")
