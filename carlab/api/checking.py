@@ -11,13 +11,13 @@ from carlab.api.arguments import above_zero
 from carlab.api.runs import html_table
 from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ActuatorFaultError, NotReadyError
+from carlab.core.quantities import Health
+from carlab.core.task import Task
 from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
     from carlab.cars.latency import LatencyParts
-    from carlab.core.quantities import Health
-    from carlab.core.task import Task
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,9 @@ from carlab.api.cars import load_car
 from carlab.api.loaded_recordings import RecordingLike, as_list, check_contents, recordings_of_runs
 from carlab.api.loaded_recordings import load_recordings as read
 from carlab.core.errors import ConfigError
+from carlab.core.tables import nearest_name
+from carlab.recording.atomic_files import write_text
+from carlab.recording.sink import make_folder, writing
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -48,7 +51,6 @@ def compare(
         ConfigError: a group is empty, a recording is in both groups, or a candidate does not exist.
         DataError: a recording cannot be read, or a group is too short or too uniform; the message has the remedy.
     """
-    from carlab.core.tables import nearest_name
     from carlab.diagnosis.comparison.candidates import change_candidates
     from carlab.diagnosis.comparison.compare import compare as search
 
@@ -79,9 +81,6 @@ def compare(
 
 
 def _save(found: Comparison, folder: Path) -> None:
-    from carlab.recording.atomic_files import write_text
-    from carlab.recording.sink import make_folder, writing
-
     with writing(folder):
         make_folder(folder)
     write_text(folder / FILE_NAME, json.dumps(found.to_dict(), indent=2) + "\n")

@@ -18,11 +18,12 @@ from carlab.api.loaded_recordings import (
     check_contents,
     load_recordings,
 )
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
+from carlab.core.tables import nearest_name
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
-    from carlab.core.episode_data import EpisodeData
     from carlab.core.recording_noise import RecordingNoise
     from carlab.diagnosis.diagnose import Outcome
     from carlab.diagnosis.findings import (
@@ -280,7 +281,6 @@ def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike])
 
 def _checked_effects(effects: Sequence[str]) -> tuple[str, ...]:
     """Names of effects as a tuple; a single string is one name. Raises ConfigError for an unknown one."""
-    from carlab.core.tables import nearest_name
     from sim_backends.effects import CATALOGUE
 
     names = (effects,) if isinstance(effects, str) else tuple(effects)

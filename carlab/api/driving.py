@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.api.drive_run import DriveRun, run_results
+from carlab.api.recordings import Recording, load
 from carlab.api.runs import (
     collecting,
     followed_by,
@@ -20,22 +21,24 @@ from carlab.api.runs import (
     viewer_connection,
 )
 from carlab.api.tasks import given_task, load_checked
+from carlab.core.clock import Clock, MonotonicClock
+from carlab.core.documents import Tick
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.geofence import rectangle
 from carlab.core.manoeuvres import MANOEUVRES
+from carlab.core.policy import Policy
+from carlab.core.quantities import CarState, Reality
+from carlab.core.task import ParkingTask, RecordedTask, Task
 from carlab.experiment.episodes.hooks import RunHooks
+from carlab.experiment.episodes.interrupts import Interrupts, check_main_thread
+from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 
 if TYPE_CHECKING:
-    from carlab.api.recordings import Recording
     from carlab.cars import CarChoice, CarFile
-    from carlab.core.clock import Clock
-    from carlab.core.documents import Tick
-    from carlab.core.episode_data import EpisodeData
-    from carlab.core.policy import Policy
     from carlab.core.safety import SafetyEnvelope
-    from carlab.core.task import Task
     from carlab.core.task_choice import TaskChoice
     from carlab.experiment.episodes.result import EpisodeResult
-    from carlab.experiment.episodes.teleop_policy import TeleopPolicy
     from carlab.recording.run_folder import RunDirectory
     from sim_backends.car_parameters import SimulatorConfig
 
@@ -139,9 +142,7 @@ def replay(
         ConfigError, DataError: an argument or the recording is invalid.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
-    from carlab.api.recordings import Recording, load
     from carlab.cars import choose_car
-    from carlab.core.episode_data import EpisodeData
     from carlab.experiment.episodes.scripted_policies import ReplayPolicy
 
     above_zero(seconds=seconds)
@@ -168,10 +169,6 @@ def replay(
 
 
 def _recorded_task(episode: EpisodeData, choice: CarChoice, seconds: float | None) -> Task:
-    from carlab.core.geofence import rectangle
-    from carlab.core.quantities import CarState, Reality
-    from carlab.core.task import RecordedTask
-
     duration_s = float(episode.times_s[-1] - episode.times_s[0])
     ticks = max(round(min(duration_s, seconds or duration_s) / choice.control_period_s), 1)
     x, y = episode.states[:, 0], episode.states[:, 1]
@@ -194,7 +191,6 @@ def _drive(
 
     From the first episode until the car is closed, a signal such as ^C interrupts nothing but the driving.
     """
-    from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.experiment.episodes.session import Session
 
     envelope = _envelope(choice.envelope, task, max_throttle)
@@ -233,8 +229,6 @@ def _policy_names() -> tuple[str, ...]:
 def _check(
     policy: str | Path | Policy, max_throttle: float | None, *, episodes: int, ticks: int | None, seed: int
 ) -> None:
-    from carlab.experiment.episodes.interrupts import check_main_thread
-
     check_main_thread()
     at_least(1, episodes=episodes, ticks=ticks)
     valid_seed(seed=seed)
@@ -270,7 +264,6 @@ def _policy_and_task(
     policy: str | Path | Policy, task: str | Task | None, track: Path | str | None, choice: CarChoice
 ) -> tuple[str | Policy, Task]:
     """The policy, which is read if it is a run's, and the task; that of the run by default."""
-    from carlab.core.task import ParkingTask
     from carlab.core.task_choice import PARKING
 
     given = given_task(task, track, choice.track)
@@ -303,8 +296,6 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
 
 def _task_to_drive(chosen: TaskChoice, choice: CarChoice) -> Task:
     """The task, checked; not carlab's parking and a recorded task, because such a drive may start at another place."""
-    from carlab.core.task import ParkingTask, RecordedTask
-
     task = chosen.load()
     is_unchecked = isinstance(task, RecordedTask) or (isinstance(task, ParkingTask) and not chosen.sha256)
     if not is_unchecked:
@@ -314,9 +305,6 @@ def _task_to_drive(chosen: TaskChoice, choice: CarChoice) -> Task:
 
 def _without_arena(policy: str | Policy, task: Task, choice: CarChoice) -> Task:
     """The task without its arena for a manoeuvre of a car that cannot move, because most manoeuvres leave the arena."""
-    from carlab.core.quantities import Reality
-    from carlab.core.task import ParkingTask
-
     is_manoeuvre = isinstance(policy, str) and policy in MANOEUVRES
     cannot_move = choice.car.reality in (Reality.SIMULATED, Reality.EMULATED)
     return replace(task, arena_m=()) if is_manoeuvre and cannot_move and isinstance(task, ParkingTask) else task
@@ -334,7 +322,6 @@ def _policy(
     """The policy, and the same object as a TeleopPolicy if a person drives (else None)."""
     from carlab.experiment.episodes.excitation_policy import ExcitationPolicy
     from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy, NeutralPolicy, ReverseParkingPolicy
-    from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 
     if not isinstance(policy, str):
         return policy, None
@@ -355,8 +342,6 @@ def _policy(
 
 def _in_real_time(hooks: RunHooks, clock: Clock) -> RunHooks:
     """Hooks with which a simulated car runs in real time, for teleoperation."""
-    from carlab.core.clock import MonotonicClock
-
     if isinstance(clock, MonotonicClock):
         return hooks
     wall = MonotonicClock()

@@ -11,11 +11,11 @@ from carlab.api.cars import car_name, car_options_text
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
 from carlab.core.method_names import current_method
+from carlab.core.task import Task
 from carlab.experiment.cluster.settings import LinkSettings
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
-    from carlab.core.task import Task
     from carlab.experiment.campaign.training_plan import TrainingPlan
     from sim_backends.car_parameters import SimulatorConfig
 

@@ -33,18 +33,21 @@ from carlab.api.runs import (
 )
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
+from carlab.core.outcome import EndReason
+from carlab.core.task import Task
+from carlab.core.version import VERSION
 from carlab.experiment.campaign.hooks import LearnHooks
+from carlab.experiment.cluster.settings import LinkSettings
+from carlab.experiment.episodes.hooks import RunHooks
+from carlab.experiment.episodes.interrupts import Interrupts, check_main_thread
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
-    from carlab.core.outcome import EndReason
-    from carlab.core.task import Task
     from carlab.experiment.campaign.campaign import Campaign
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
     from carlab.experiment.campaign.quick_check import EpisodeCheck
     from carlab.experiment.cluster.trainer import ClusterTrainer
-    from carlab.experiment.episodes.hooks import RunHooks
     from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
@@ -203,7 +206,6 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
     from carlab.experiment.campaign.campaign import saved_seed
     from carlab.experiment.campaign.live_view import LiveSettings, LiveView
     from carlab.experiment.campaign.report import write_report
-    from carlab.experiment.episodes.interrupts import Interrupts
 
     _check(request)
     connect = viewer_connection(request.live, request.viewer)
@@ -243,10 +245,8 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
 
 def _cluster_trainer(request: LearnRequest, campaign: Campaign, hooks: LearnHooks) -> ClusterTrainer:
     """The trainer of ``ray``. Raises ConfigError if Ray is not installed, or the task cannot be sent."""
-    from carlab.core.version import VERSION
     from carlab.experiment.cluster.link_process import LinkProcess
     from carlab.experiment.cluster.order import check_task
-    from carlab.experiment.cluster.settings import LinkSettings
     from carlab.experiment.cluster.trainer import ClusterTrainer
     from carlab.jobs.ray_executor import require_ray
 
@@ -271,7 +271,6 @@ def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
 
 def _check(request: LearnRequest) -> None:
     from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
-    from carlab.experiment.episodes.interrupts import check_main_thread
     from learning.devices import available
 
     check_main_thread()

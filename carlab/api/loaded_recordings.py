@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from carlab.api.recordings import Recording, is_csv, required_file
-from carlab.core.errors import ConfigError
+from carlab.api.recordings import Recording, is_csv, load, required_file
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import DataFault, RecordingUse
 
 RecordingSource: TypeAlias = "Recording | EpisodeData | Path"
@@ -40,9 +40,6 @@ class LoadedRecordings:
 
 def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingSource]:
     """Recordings as a list, with strings converted to paths. Raises ConfigError for another type."""
-    from carlab.core.episode_data import EpisodeData
-    from carlab.core.errors import ConfigError
-
     kinds = (str, Path, Recording, EpisodeData)
     items = list(given) if isinstance(given, Iterable) and not isinstance(given, kinds) else [given]
     for item in items:
@@ -136,8 +133,6 @@ def load_recordings(items: list[RecordingSource], role: str, latency_s: float) -
 
 def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
     """Add the episodes of one recording."""
-    from carlab.api.recordings import load
-    from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import RecordingUse
     from carlab.diagnosis.state_alignment import align_states
 
@@ -161,7 +156,6 @@ def _check_arrays(episode: EpisodeData) -> None:
     """Raise DataError if times do not increase or are not in seconds, or if commands exceed [-1, 1]."""
     import numpy as np
 
-    from carlab.core.errors import DataError
     from carlab.recording.audit.file_checks import MAX_COMMAND, MAX_PERIOD_S
 
     if not np.all(np.diff(episode.times_s) > 0.0):

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.runs import html_table
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
+from carlab.recording.episode_builder import RECOVERY
 
 if TYPE_CHECKING:
-    from carlab.core.episode_data import EpisodeData
     from carlab.recording.audit.report import AuditReport
     from carlab.recording.column_mapping import ColumnMapping
 
@@ -137,7 +138,6 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
         return Recording(path, imported.episodes, imported.announcement, imported.report, resolved)
     if mapping is not None or options:
         raise ConfigError(f"{path} is not a CSV; remove the mapping and its options.")
-    from carlab.recording.episode_builder import RECOVERY
     from carlab.recording.mcap.source import read_episode
 
     episode = read_episode(path)

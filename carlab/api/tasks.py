@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.core.errors import ConfigError
+from carlab.core.task import Task
+from carlab.experiment.episodes.task_check import check_task
 
 if TYPE_CHECKING:
     from carlab.core.keep_out import Corners
-    from carlab.core.task import Task
     from carlab.core.task_choice import TaskChoice
     from carlab.core.track import Track
 
@@ -61,8 +62,6 @@ def load_checked(choice: TaskChoice, arena_m: Corners) -> Task:
         choice: the task.
         arena_m: arena of the car; empty without one.
     """
-    from carlab.experiment.episodes.task_check import check_task
-
     task = choice.load()
     check_task(task, arena_m)
     return task

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from carlab.cli.console import progress
+from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, run_parallel
 
@@ -72,7 +73,6 @@ def run_jobs(
     Returns:
         All results in the order of the study, and whether ^C ended it.
     """
-    from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.jobs.ray_executor import chosen_executor
 
     found: dict[int, list[Result]] = {}

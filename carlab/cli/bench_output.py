@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 from carlab.cli.bench_jobs import StudyJob, read_figures, run_jobs
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
+from carlab.experiment.episodes.interrupts import Interrupts
+from carlab.jobs.child_jobs import ChildJob
+from carlab.recording.atomic_files import write_text
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
-    from carlab.jobs.child_jobs import ChildJob
     from carlab.studies.regression.scores import Row, Score
     from carlab.studies.regression.study import Progress
 
@@ -29,8 +31,6 @@ def command() -> str:
 
 def write_figures(path: Path, figures: Mapping[str, Any]) -> None:
     """Write a JSON file atomically. Raises DataError on failure; an existing file then remains."""
-    from carlab.recording.atomic_files import write_text
-
     write_text(path, json.dumps(figures, indent=2) + "\n")
 
 
@@ -47,8 +47,6 @@ def run_and_write(
     Returns:
         The scores, and whether ^C ended the study.
     """
-    from carlab.experiment.episodes.interrupts import Interrupts
-
     scores: list[Score] = []
     with Interrupts() as interrupts, progress(speed_estimate_period_s=SPEED_PERIOD_S) as bar:
         task = bar.add_task(name, total=None, note="")

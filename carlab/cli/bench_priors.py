@@ -14,6 +14,7 @@ from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, uses_jobs
 from carlab.cli.bench_options import row_counts
 from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
 from carlab.cli.console import console, progress
+from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
 
@@ -32,7 +33,6 @@ HOLDOUT_SHARE = 0.1
 def run_priors(options: BenchOptions) -> int:
     """Record or read recordings, diagnose all but the held-out one, fit a model under each prior, and print."""
     from carlab.cars import load_car_file
-    from carlab.cli.recordings import load_episodes
     from carlab.studies.priors import prior_models, run_prior_study
     from carlab.studies.regression.recordings import recorded_case
 

@@ -10,6 +10,7 @@ from carlab.cli.bench_options import row_counts
 from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console
+from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -77,7 +78,6 @@ def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Scor
 
 
 def _recorded(options: BenchOptions) -> RecordedCase:
-    from carlab.cli.recordings import load_episodes
     from carlab.studies.regression.recordings import recorded_case
 
     files = _recordings(options)

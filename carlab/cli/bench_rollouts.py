@@ -12,11 +12,13 @@ from carlab.cli.bench_output import command, write_figures
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
+from carlab.cli.recordings import load_episodes
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
+from carlab.experiment.episodes.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
-    from carlab.core.episode_data import EpisodeData
     from carlab.studies.regression.recordings import RecordedCase
     from carlab.studies.rollouts import RolloutScore, Rows
 
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
 
 def run_rollouts(options: BenchOptions) -> int:
     """Fit learned cars and their disturbances, and print coverage and error of their rollouts."""
-    from carlab.cli.recordings import load_episodes
     from carlab.studies.regression.recordings import recorded_case
 
     if options.data is None:
@@ -50,7 +51,6 @@ def run_rollouts(options: BenchOptions) -> int:
 
 def _run_here(options: BenchOptions, case: RecordedCase, recordings: Recordings) -> tuple[list[RolloutScore], bool]:
     from carlab.cars import load_car_file
-    from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.studies.rollouts import run_rollout_study
 
     scores: list[RolloutScore] = []

@@ -17,11 +17,12 @@ from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
+from carlab.core.documents import Tick
+from carlab.core.outcome import EndReason
 from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
     from carlab.api import DriveRun
-    from carlab.core.documents import Tick
 
 
 @dataclass
@@ -78,8 +79,6 @@ class Drive:
         return RunHooks(**common_hooks(bar), on_episode=on_episode, on_tick=on_tick)
 
     def _report(self, run: DriveRun) -> int:
-        from carlab.core.outcome import EndReason
-
         results = run.episodes
         if not results:
             console.print("No episode was driven.")

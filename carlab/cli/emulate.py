@@ -13,6 +13,8 @@ from carlab.api.arguments import valid_seed
 from carlab.cli.console import console
 from carlab.cli.options import arguments_of, log_file
 from carlab.core.errors import ConfigError, NotReadyError
+from carlab.experiment.episodes.interrupts import Interrupts
+from drivers.calibration import ActuatorCalibration
 
 
 @dataclass
@@ -62,8 +64,6 @@ class Emulate:
 
         from carlab.cars import default_car, load_car_file
         from carlab.cars.emulated_world import World, WorldConfig
-        from carlab.experiment.episodes.interrupts import Interrupts
-        from drivers.calibration import ActuatorCalibration
 
         self._check_options()
         valid_seed(seed=self.seed)

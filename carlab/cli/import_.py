@@ -14,6 +14,7 @@ from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import print_findings
 from carlab.core.errors import ConfigError, DataError
+from carlab.recording.atomic_files import write_text
 
 if TYPE_CHECKING:
     from carlab.recording.audit.report import AuditReport
@@ -185,8 +186,6 @@ class Import:
         return 0
 
     def _write_report(self, report: AuditReport) -> None:
-        from carlab.recording.atomic_files import write_text
-
         if self.report is not None:
             self.report.parent.mkdir(parents=True, exist_ok=True)
             write_text(self.report, json.dumps(report.to_dict(), indent=2) + "\n")

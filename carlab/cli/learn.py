@@ -19,11 +19,11 @@ from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
+from carlab.core.documents import Tick
 from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
     from carlab.api import LearnRun
-    from carlab.core.documents import Tick
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.quick_check import EpisodeCheck
 

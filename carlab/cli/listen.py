@@ -11,7 +11,9 @@ from rich.text import Text
 from carlab.api.arguments import above_zero
 from carlab.cli.console import console, fail, readings_table
 from carlab.cli.options import arguments_of
+from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
+from carlab.experiment.episodes.interrupts import Interrupts
 
 
 @dataclass
@@ -54,8 +56,6 @@ class Listen:
     def run(self) -> int:
         """Print four frames per second and new problems of the poses, then the statistics and the last problems."""
         from carlab.cars import load_car_file
-        from carlab.core.clock import MonotonicClock
-        from carlab.experiment.episodes.interrupts import Interrupts
         from mocap.config import MocapConfig
         from mocap.rigid_body import RigidBodyPoseSource
 

@@ -18,6 +18,8 @@ from carlab.cli.exit_codes import EXIT_INTERRUPTED
 from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import ConfigError
 from carlab.core.version import VERSION
+from carlab.experiment.episodes.interrupts import Interrupts
+from carlab.jobs.child_jobs import CARLAB
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -126,7 +128,6 @@ class Prove:
 
     def _run(self, make: Callable[..., AnyProof], stages: Callable[[AnyProof], bool]) -> AnyProof | None:
         """Make a proof with the options of its run, and run its stages; None if it is stopped."""
-        from carlab.experiment.episodes.interrupts import Interrupts
         from carlab.jobs.ray_executor import chosen_executor
 
         executor_of_options = chosen_executor(self.ray, self.jobs)
@@ -154,7 +155,6 @@ class Prove:
     def _real(self) -> int:
         from carlab.benchmark.real.runner import RealProof, drawn_specs
         from carlab.cli.prove_real import car_path, run_stages, score, tables_in
-        from carlab.jobs.child_jobs import CARLAB
 
         car, recordings = car_path(self.car, self.out), tables_in(self.data)
         specs, refused = drawn_specs(self.seed, self.limit, recordings)
@@ -169,7 +169,6 @@ class Prove:
         from carlab.benchmark.public_simulators.commonroad import require_public_simulator
         from carlab.benchmark.public_simulators.study import study
         from carlab.benchmark.public_simulators.study_page import TARGET_RATIO
-        from carlab.experiment.episodes.interrupts import Interrupts
 
         require_public_simulator()
         seeds = range(self.seed, self.seed + (self.limit or 1))

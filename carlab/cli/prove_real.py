@@ -9,21 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from carlab.api.cars import load_car
 from carlab.api.recordings import load
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, table
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.quantities import FloatArray
 
 if TYPE_CHECKING:
     from carlab.benchmark.real.runner import RealProof
-    from carlab.core.quantities import FloatArray
 
 
 def car_path(car: str, folder: Path) -> Path:
     """The car file, written to the folder if it is a preset."""
     import tomli_w
-
-    from carlab.api.cars import load_car
 
     if not car:
         raise ConfigError("--set real needs the car file of the recordings; add --car FILE.")

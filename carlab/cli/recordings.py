@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.api.recordings import load
+from carlab.api.recordings import Recording, load
 from carlab.cli.console import console, table
 from carlab.core.episode_data import EpisodeData
 
 if TYPE_CHECKING:
-    from carlab.api.recordings import Recording
     from carlab.diagnosis.findings import FitErrors
     from carlab.recording.audit.report import AuditReport
 

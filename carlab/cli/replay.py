@@ -13,11 +13,13 @@ from carlab.api import predict, replay
 from carlab.api.arguments import above_zero, valid_seed
 from carlab.api.recordings import load
 from carlab.cli.console import banner, console, fail, progress, table
+from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import OF_CALL, CarOptions, arguments_of, new_file, options_of
 from carlab.cli.recordings import print_errors, print_recording
 from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
+from carlab.core.outcome import EndReason
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 from carlab.experiment.episodes.hooks import RunHooks
 
@@ -139,9 +141,6 @@ class Replay:
         table(f"By channel, {found.score.whole.part}", columns, rows)
 
     def _drive(self) -> int:
-        from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-        from carlab.core.outcome import EndReason
-
         recording = print_recording(load(self.recording))
         with progress() as bar:
             row = bar.add_task("replay", total=None, note="")

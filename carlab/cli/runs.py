@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from carlab.cli.console import banner, console, fail, progress
 from carlab.cli.exit_codes import EXIT_SAFETY_STOP
+from carlab.core.car import Car
 from carlab.core.errors import ConfigError
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import CarState
+from carlab.experiment.episodes.interrupts import Interrupts
 
 if TYPE_CHECKING:
     from rich.progress import Progress
-
-    from carlab.core.car import Car
-    from carlab.core.outcome import EndReason
-    from carlab.core.quantities import CarState
 
 
 def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:
@@ -64,8 +64,6 @@ def common_hooks(bar: Progress) -> dict[str, Any]:
 @contextmanager
 def search_callbacks(name: str) -> Iterator[dict[str, Any]]:
     """Callbacks ``progress`` and ``stop`` of a search: a bar in percent, and ^C. A second ^C ends the program."""
-    from carlab.experiment.episodes.interrupts import Interrupts
-
     with Interrupts(second_raises=True) as interrupts, progress() as bar:
         row = bar.add_task(name, total=100, note="")
         yield {

@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -17,10 +16,8 @@ from carlab.api.runs import viewer_program
 from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import load_episodes
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, NotReadyError
-
-if TYPE_CHECKING:
-    from carlab.core.episode_data import EpisodeData
 
 REPORT_FILE = "report.rrd"
 PAGE_FILE = "report.html"
