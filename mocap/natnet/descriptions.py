@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from struct import Struct
 from struct import error as StructError
+from typing import Any
 
 from carlab.core.errors import ProtocolError
 from mocap.natnet.models import (
@@ -28,11 +31,63 @@ from mocap.natnet.models import (
 from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_counted, encode_text
 
 BODY = Struct("<ii3f")
-PLATE = Struct("<ff3f144f12f")
-POSE = Struct("<3f4f")
-ASSET_MARKER = Struct("<i3ffh")
 
 _BITSTREAM_4_0 = BitstreamVersion(4, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """How a value is read and encoded, and its least size."""
+
+    read: Callable[[Reader], Any]
+    encode: Callable[[Any], bytes]
+    smallest_bytes: int
+
+
+def _number(code: str) -> _Field:
+    layout = Struct(f"<{code}")
+    return _Field(lambda reader: reader.take(layout)[0], layout.pack, layout.size)
+
+
+def _floats(count: int) -> _Field:
+    layout = Struct(f"<{count}f")
+    return _Field(lambda reader: reader.take(layout), lambda values: layout.pack(*values), layout.size)
+
+
+def _several(field: _Field) -> _Field:
+    """The number of entries, and the entries."""
+
+    def read(reader: Reader) -> tuple[Any, ...]:
+        return tuple([field.read(reader) for _ in range(reader.count(field.smallest_bytes))])
+
+    return _Field(read, lambda values: encode_counted(map(field.encode, values)), INT32.size)
+
+
+def _record(kind: Callable[..., Any], *fields: _Field) -> _Field:
+    """The attributes of a description, one after the other."""
+    return _Field(
+        lambda reader: kind(*[field.read(reader) for field in fields]),
+        lambda item: b"".join([field.encode(value) for field, value in zip(fields, item, strict=True)]),
+        sum(field.smallest_bytes for field in fields),
+    )
+
+
+def _layouts(version: BitstreamVersion) -> dict[type, _Field]:
+    """The layout of each class of descriptions; its position in the dictionary is the number of its type."""
+    text, integer, real, vector = _Field(Reader.text, encode_text, 1), _number("i"), _number("f"), _floats(3)
+    texts = _several(text)
+    body = _Field(partial(_read_body, version), partial(_encode_body, version), 1 + BODY.size)
+    marker = _record(AssetMarkerDescription, text, integer, vector, real, _number("h"))
+    plate = (integer, text, real, real, vector, _floats(144), _floats(12), integer, integer, texts)
+    return {
+        MarkerSetDescription: _record(MarkerSetDescription, text, texts),
+        RigidBodyDescription: body,
+        SkeletonDescription: _record(SkeletonDescription, text, integer, _several(body)),
+        ForcePlateDescription: _record(ForcePlateDescription, *plate),
+        DeviceDescription: _record(DeviceDescription, integer, text, text, integer, integer, texts),
+        CameraDescription: _record(CameraDescription, text, vector, _floats(4)),
+        AssetDescription: _record(AssetDescription, text, integer, integer, _several(body), _several(marker)),
+    }
 
 
 def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Description, ...]:
@@ -47,16 +102,17 @@ def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Descrip
     check_readable(version)
     reader = Reader(payload, f"NatNet model definitions read as bitstream {version}")
     sized = version >= BITSTREAM_4_1
+    layouts = list(_layouts(version).values())
     descriptions: list[Description] = []
     for index in range(reader.count(5)):
         reader.section = f"description {index}"
         kind = reader.integer()
-        read = _READERS.get(kind)
+        read = layouts[kind].read if 0 <= kind < len(layouts) else None
         if not sized:
             if read is None:
                 reader.pos -= INT32.size
                 raise reader.error(f"type {kind} is unknown and bitstream {version} gives no size to skip it by")
-            descriptions.append(read(reader, version))
+            descriptions.append(read(reader))
             continue
         size = reader.integer()
         if size < 0 or size > reader.end - reader.pos:
@@ -66,7 +122,7 @@ def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Descrip
             descriptions.append(UnknownDescription(kind, payload[reader.pos : stop]))
         else:
             whole, reader.end = reader.end, stop
-            descriptions.append(read(reader, version))
+            descriptions.append(read(reader))
             reader.end = whole
         reader.pos = stop
     reader.section = "the end"
@@ -74,11 +130,7 @@ def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Descrip
     return tuple(descriptions)
 
 
-def _read_marker_set(reader: Reader, version: BitstreamVersion) -> MarkerSetDescription:
-    return MarkerSetDescription(reader.text(), reader.texts(reader.count(1)))
-
-
-def _read_body(reader: Reader, version: BitstreamVersion) -> RigidBodyDescription:
+def _read_body(version: BitstreamVersion, reader: Reader) -> RigidBodyDescription:
     name = reader.text()
     body_id, parent_id, *offset = reader.take(BODY)
     positions: tuple[tuple[float, ...], ...] = ()
@@ -91,67 +143,6 @@ def _read_body(reader: Reader, version: BitstreamVersion) -> RigidBodyDescriptio
         if version >= _BITSTREAM_4_0:
             names = reader.texts(markers)
     return RigidBodyDescription(name, body_id, parent_id, tuple(offset), positions, labels, names)  # type: ignore[arg-type]
-
-
-def _read_skeleton(reader: Reader, version: BitstreamVersion) -> SkeletonDescription:
-    name, skeleton_id = reader.text(), reader.integer()
-    bones = tuple([_read_body(reader, version) for _ in range(reader.count(1 + BODY.size))])
-    return SkeletonDescription(name, skeleton_id, bones)
-
-
-def _read_force_plate(reader: Reader, version: BitstreamVersion) -> ForcePlateDescription:
-    plate_id, serial = reader.integer(), reader.text()
-    numbers = reader.take(PLATE)
-    plate_type, channel_type = reader.take(PAIR)
-    names = reader.texts(reader.count(1))
-    width, length, origin, calibration, corners = *numbers[:2], numbers[2:5], numbers[5:149], numbers[149:]
-    return ForcePlateDescription(
-        plate_id,
-        serial,
-        width,
-        length,
-        origin,
-        calibration,
-        corners,
-        plate_type,
-        channel_type,
-        names,
-    )
-
-
-def _read_device(reader: Reader, version: BitstreamVersion) -> DeviceDescription:
-    device_id, name, serial = reader.integer(), reader.text(), reader.text()
-    device_type, channel_type = reader.take(PAIR)
-    return DeviceDescription(device_id, name, serial, device_type, channel_type, reader.texts(reader.count(1)))
-
-
-def _read_camera(reader: Reader, version: BitstreamVersion) -> CameraDescription:
-    name = reader.text()
-    pose = reader.take(POSE)
-    return CameraDescription(name, pose[:3], pose[3:])
-
-
-def _read_asset(reader: Reader, version: BitstreamVersion) -> AssetDescription:
-    name = reader.text()
-    asset_type, asset_id = reader.take(PAIR)
-    bodies = tuple([_read_body(reader, version) for _ in range(reader.count(1 + BODY.size))])
-    markers = []
-    for _ in range(reader.count(1 + ASSET_MARKER.size)):
-        marker_name = reader.text()
-        marker_id, x, y, z, size, params = reader.take(ASSET_MARKER)
-        markers.append(AssetMarkerDescription(marker_name, marker_id, (x, y, z), size, params))
-    return AssetDescription(name, asset_type, asset_id, bodies, tuple(markers))
-
-
-_READERS: dict[int, Callable[[Reader, BitstreamVersion], Description]] = {
-    0: _read_marker_set,
-    1: _read_body,
-    2: _read_skeleton,
-    3: _read_force_plate,
-    4: _read_device,
-    5: _read_camera,
-    6: _read_asset,
-}
 
 
 def encode_model_def(descriptions: Sequence[Description], version: BitstreamVersion = NEWEST_BITSTREAM) -> bytes:
@@ -175,37 +166,15 @@ def encode_model_def(descriptions: Sequence[Description], version: BitstreamVers
 
 
 def _encode(item: Description, version: BitstreamVersion) -> tuple[int, bytes]:
-    match item:
-        case MarkerSetDescription():
-            return 0, encode_text(item.name) + _texts(item.marker_names)
-        case RigidBodyDescription():
-            return 1, _encode_body(item, version)
-        case SkeletonDescription():
-            bones = encode_counted(_encode_body(bone, version) for bone in item.bones)
-            return 2, encode_text(item.name) + INT32.pack(item.id) + bones
-        case ForcePlateDescription():
-            numbers = PLATE.pack(item.width_m, item.length_m, *item.origin_m, *item.calibration, *item.corners_m)
-            kinds = PAIR.pack(item.plate_type, item.channel_data_type)
-            return 3, INT32.pack(item.id) + encode_text(item.serial) + numbers + kinds + _texts(item.channel_names)
-        case DeviceDescription():
-            kinds = PAIR.pack(item.device_type, item.channel_data_type)
-            names = encode_text(item.name) + encode_text(item.serial)
-            return 4, INT32.pack(item.id) + names + kinds + _texts(item.channel_names)
-        case CameraDescription():
-            return 5, encode_text(item.name) + POSE.pack(*item.position_m, *item.quaternion)
-        case AssetDescription():
-            bodies = encode_counted(_encode_body(body, version) for body in item.rigid_bodies)
-            markers = encode_counted(
-                encode_text(m.name) + ASSET_MARKER.pack(m.id, *m.position_m, m.size_m, m.params) for m in item.markers
-            )
-            return 6, encode_text(item.name) + PAIR.pack(item.asset_type, item.id) + bodies + markers
-        case UnknownDescription():
-            if version < BITSTREAM_4_1:
-                raise ProtocolError(f"Bitstream {version} cannot carry a description of unknown type {item.type_id}.")
-            return item.type_id, item.data
+    if not isinstance(item, UnknownDescription):
+        layouts = _layouts(version)
+        return list(layouts).index(type(item)), layouts[type(item)].encode(item)
+    if version < BITSTREAM_4_1:
+        raise ProtocolError(f"Bitstream {version} cannot carry a description of unknown type {item.type_id}.")
+    return item.type_id, item.data
 
 
-def _encode_body(body: RigidBodyDescription, version: BitstreamVersion) -> bytes:
+def _encode_body(version: BitstreamVersion, body: RigidBodyDescription) -> bytes:
     count = len(body.marker_positions_m)
     labels = body.marker_labels or (0,) * count
     names = body.marker_names or tuple(f"Marker{i + 1}" for i in range(count))
@@ -217,7 +186,3 @@ def _encode_body(body: RigidBodyDescription, version: BitstreamVersion) -> bytes
     if version >= _BITSTREAM_4_0:
         parts += [encode_text(name) for name in names]
     return b"".join(parts)
-
-
-def _texts(names: Sequence[str]) -> bytes:
-    return encode_counted(encode_text(name) for name in names)
