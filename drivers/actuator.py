@@ -8,10 +8,10 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from typing import Self
 
 from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, NotArmedError, NotOpenError, NotReadyError
 from carlab.core.quantities import NEUTRAL, Action, Health
+from carlab.core.resource import Resource
 from drivers.calibration import ActuatorCalibration, DeviceCommand
 from drivers.config import ActuatorConfig
 from drivers.sender.logic import Order, Request, SenderState
@@ -26,7 +26,7 @@ POLL_S = 0.001
 SAFETY_STOP = "The car was stopped for safety; check the car, then reset the fault and arm again."
 
 
-class Actuator:
+class Actuator(Resource):
     """Steering servo and drive motor of a car, commanded through a sender process.
 
     A separate process sends the commands (``drivers.sender.process``); this object posts the newest command to it. The
@@ -255,13 +255,6 @@ class Actuator:
             self._sender = None
             atexit.unregister(self.close)
             sender.close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     def _opened(self) -> Sender:
         if self._sender is None:

@@ -12,9 +12,9 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Self
 
 from carlab.core.errors import ProtocolError
+from carlab.core.resource import Resource
 from mocap.config import MocapConfig
 from mocap.natnet import messages, sockets
 from mocap.natnet.bitstream_switch import BitstreamSwitch
@@ -43,7 +43,7 @@ FrameListener = Callable[[Frame, int, float, float], None]
 """Called in the receiver thread with a frame, its sequence number, capture and receive time [s, host monotonic]."""
 
 
-class NatNetClient:
+class NatNetClient(Resource):
     """Connection to one NatNet server. Constructing does nothing; ``open`` or ``with`` connects.
 
     ``on_models`` gets no definitions once the server has restarted: until it sends them, its ids may be others.
@@ -163,13 +163,6 @@ class NatNetClient:
         if self._data is not None:
             self._data.close()
             self._data = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     @property
     def is_live(self) -> bool:

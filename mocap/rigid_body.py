@@ -9,10 +9,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import takewhile
 from statistics import median
-from typing import Self
 
 from carlab.core.errors import NotReadyError
 from carlab.core.quantities import PoseSample
+from carlab.core.resource import Resource
 from mocap.axes import base_link_pose, tilt_rad, z_up_quaternion, z_up_vector
 from mocap.config import MocapConfig
 from mocap.natnet.models import Description, Frame, Quaternion, RigidBody, RigidBodyDescription
@@ -35,7 +35,7 @@ RECENT_SHARE = 0.2
 """Share of the recent frames that may be tilted, or invalid, by single errors of tracking [1]."""
 
 
-class RigidBodyPoseSource:
+class RigidBodyPoseSource(Resource):
     """Poses of one rigid body, received in a separate thread.
 
     A frame in which the body is untracked, is missing, or has an invalid pose, and a frame of a recorded take, gives a
@@ -203,13 +203,6 @@ class RigidBodyPoseSource:
         """Disconnect; samples stay readable. Idempotent, safe after a failed open."""
         self._client.close()
         self._is_open = False
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     @property
     def client(self) -> NatNetClient:

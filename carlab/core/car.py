@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Self
+from abc import abstractmethod
 
 from carlab.core.clock import Clock
 from carlab.core.errors import ActionOutOfRangeError
 from carlab.core.quantities import Action, ActionLimits, CarState, Health, Observation, Reality
+from carlab.core.resource import Resource
 
 
-class Car(ABC):
+class Car(Resource):
     """Interface of a car.
 
     Constructing does nothing. ``open`` connects without motion; the car stays disarmed and accepts only neutral.
@@ -71,7 +71,7 @@ class Car(ABC):
         """Put the car at ``state`` without driving; returns False if a person has to do it."""
         return False
 
-    def seed_noise(self, seed: int) -> None:  # noqa: B027
+    def seed_noise(self, seed: int) -> None:
         """Restart the random numbers of simulated sensors with a seed; real sensors have none."""
 
     def check(self, action: Action) -> None:
@@ -84,14 +84,3 @@ class Car(ABC):
                 raise ActionOutOfRangeError(
                     f"{channel} {value:+.3f} is beyond the car's limit of {limit:.3f}; clip it or raise the limit."
                 )
-
-    def __enter__(self) -> Self:
-        try:
-            self.open()
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()

@@ -7,12 +7,13 @@ import logging
 import queue
 import threading
 from collections.abc import Sequence
-from typing import Self, cast
+from typing import cast
 
 from carlab.core.clock import monotonic_ns, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, SafetyEvent
 from carlab.core.errors import NotOpenError
 from carlab.core.outcome import EndReason
+from carlab.core.resource import Resource
 from carlab.recording.sink import Item, LogLine, Sink, describe_os_error
 
 logger = logging.getLogger(__name__)
@@ -21,7 +22,7 @@ _UNDROPPABLE = (EpisodeStarted, EpisodeEnded, SafetyEvent)
 _CLOSE = object()
 
 
-class Recorder:
+class Recorder(Resource):
     """Distributes the documents of one episode to sinks without blocking the emitting thread.
 
     If the queue is full, ticks, transitions, health readings and log lines are dropped (``dropped`` counts them, also
@@ -112,13 +113,6 @@ class Recorder:
                 )
                 return
             self._thread.join(min(0.05, timeout_s))
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     def _run(self) -> None:
         sinks = list(self._sinks)

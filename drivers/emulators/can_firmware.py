@@ -12,10 +12,10 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Self
 
 import can
 
+from carlab.core.resource import Resource
 from drivers.config import MULTICAST_GROUP
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
@@ -35,7 +35,7 @@ _SIMPLE = {
 }
 
 
-class CanFirmware:
+class CanFirmware(Resource):
     """A ``VescFirmware`` on a CAN bus; one thread serves it between ``open`` and ``close``.
 
     Args:
@@ -89,13 +89,6 @@ class CanFirmware:
             self._bus.shutdown()
             self._bus = None
         self.log.close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     def _serve(self, bus: can.BusABC) -> None:
         while not self._stop.is_set():

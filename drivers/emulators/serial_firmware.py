@@ -16,8 +16,8 @@ import time
 import tty
 from collections import deque
 from pathlib import Path
-from typing import Self
 
+from carlab.core.resource import Resource
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
@@ -27,7 +27,7 @@ POLL_S = 0.005
 BITS_PER_BYTE = 10
 
 
-class SerialFirmware:
+class SerialFirmware(Resource):
     """A ``VescFirmware`` behind a pseudo-terminal; one thread serves it between ``open`` and ``close``.
 
     Args:
@@ -132,13 +132,6 @@ class SerialFirmware:
             if self.link is not None and self.link.is_symlink():
                 self.link.unlink()
         self.log.close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     def send_raw(self, data: bytes) -> None:
         """Send raw bytes to the host, for example garbage."""

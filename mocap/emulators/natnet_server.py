@@ -15,9 +15,10 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Literal
 
 from carlab.core.errors import ConfigError, NotOpenError, ProtocolError
+from carlab.core.resource import Resource
 from mocap.config import check_multicast_group
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.scene import EmulatedBody, EmulatedScene, RigidBodySample
@@ -83,7 +84,7 @@ def _check_servable(version: BitstreamVersion, rate_hz: float, mode: str) -> Non
         raise ConfigError(f"The emulated server's mode is '{mode}'; choose unicast or multicast.")
 
 
-class NatNetServer:
+class NatNetServer(Resource):
     """An emulated server. Constructing does nothing; ``open`` or ``with`` binds the ports and starts to serve.
 
     By default a thread serves. A process with its own loop calls ``open(threaded=False)`` and then ``step`` at each
@@ -190,13 +191,6 @@ class NatNetServer:
             if sock is not None:
                 sock.close()
         self._command = self._data = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.close()
 
     def _serve(self) -> None:
         try:
