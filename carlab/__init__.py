@@ -16,36 +16,33 @@ from typing import TYPE_CHECKING
 from carlab.core.version import VERSION as __version__
 
 if TYPE_CHECKING:
-    from carlab.api import (
-        CarCheck,
-        DiagnosisReport,
-        DriveRun,
-        LearnHooks,
-        LearnRun,
-        PredictionErrors,
-        Recording,
-        RunHooks,
-        check,
-        compare,
-        diagnose,
-        drive,
-        learn,
-        load,
-        load_car,
-        predict,
-        replay,
-        save_run,
-    )
+    from carlab.api.cars import load_car
+    from carlab.api.checking import CarCheck, check
+    from carlab.api.comparison import compare
+    from carlab.api.diagnosis import DiagnosisReport, diagnose
+    from carlab.api.drive_run import DriveRun
+    from carlab.api.driving import drive, replay
+    from carlab.api.learning import LearnRun, learn
+    from carlab.api.prediction import PredictionErrors, predict
+    from carlab.api.recordings import Recording, load, save_run
     from carlab.core.car import Car
     from carlab.core.errors import CarlabError
     from carlab.core.quantities import NEUTRAL, Action, CarState, Health, Observation, PoseSample, Reality
+    from carlab.experiment.campaign.hooks import LearnHooks
+    from carlab.experiment.episodes.hooks import RunHooks
 
 _MODULES = {
-    "api": (
-        *("CarCheck", "DiagnosisReport", "DriveRun", "LearnHooks", "LearnRun", "PredictionErrors"),
-        *("Recording", "RunHooks"),
-        *("check", "compare", "diagnose", "drive", "learn", "load", "load_car", "predict", "replay", "save_run"),
-    ),
+    "api.cars": ("load_car",),
+    "api.checking": ("CarCheck", "check"),
+    "api.comparison": ("compare",),
+    "api.diagnosis": ("DiagnosisReport", "diagnose"),
+    "api.drive_run": ("DriveRun",),
+    "api.driving": ("drive", "replay"),
+    "api.learning": ("LearnRun", "learn"),
+    "api.prediction": ("PredictionErrors", "predict"),
+    "api.recordings": ("Recording", "load", "save_run"),
+    "experiment.campaign.hooks": ("LearnHooks",),
+    "experiment.episodes.hooks": ("RunHooks",),
     "core.car": ("Car",),
     "core.errors": ("CarlabError",),
     "core.quantities": ("NEUTRAL", "Action", "CarState", "Health", "Observation", "PoseSample", "Reality"),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def run_realcars(options: BenchOptions) -> int:
     """Diagnose the recordings to fit, and print the errors of all models on the held-out recordings."""
-    from carlab.api import diagnose
+    from carlab.api.diagnosis import diagnose
     from carlab.diagnosis.report.events import diagnosed_event_sentences
     from carlab.studies.real_cars import as_json, real_car_errors, split_by_name
 

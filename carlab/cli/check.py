@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from rich.text import Text
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api import check
+from carlab.api.checking import check
 from carlab.cli.console import banner, console, fail, readings_table, table
 from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.core.errors import NotReadyError

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from carlab.api import compare
+from carlab.api.comparison import compare
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import OF_CALL, arguments_of, options_of, report_folder

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api import drive
+from carlab.api.driving import drive
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
@@ -22,7 +22,7 @@ from carlab.core.outcome import EndReason
 from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
-    from carlab.api import DriveRun
+    from carlab.api.drive_run import DriveRun
 
 
 @dataclass

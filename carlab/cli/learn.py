@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes, arg
 
-from carlab.api import drive, learn
+from carlab.api.driving import drive
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
+from carlab.api.learning import learn
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
@@ -23,7 +24,7 @@ from carlab.core.documents import Tick
 from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
-    from carlab.api import LearnRun
+    from carlab.api.learning import LearnRun
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.quick_check import EpisodeCheck
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
-from carlab.api import drive
 from carlab.api.cars import car_options_text
+from carlab.api.driving import drive
 from carlab.core.errors import ConfigError, DataError
 
 OF_CALL: Any = object()

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from carlab.api import predict, replay
 from carlab.api.arguments import above_zero, valid_seed
+from carlab.api.driving import replay
+from carlab.api.prediction import predict
 from carlab.api.recordings import load
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
@@ -24,7 +25,7 @@ from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 from carlab.experiment.episodes.hooks import RunHooks
 
 if TYPE_CHECKING:
-    from carlab.api import PredictionErrors
+    from carlab.api.prediction import PredictionErrors
 
 
 @dataclass
