@@ -33,11 +33,8 @@ def _join_lines(option_class: type) -> None:
     keeps the line breaks of attribute docstrings, but not those of an ``Args`` section in the docstring of a class.
     Therefore this function copies the texts into such a section.
     """
-    from docstring_parser.attrdoc import AttributeDocstrings
-
     summary = inspect.getdoc(option_class) or ""
-    own = {name: text for name, (text, *_) in AttributeDocstrings().get_attr_docs(option_class).items() if text}
-    texts = _argument_texts(option_class) | own
+    texts = _argument_texts(option_class) | _attribute_texts(option_class)
     rows = [f"    {name}: {' '.join(texts[name].split())}" for name in _option_names(option_class) if name in texts]
     if rows and MARK not in summary:
         option_class.__doc__ = summary + MARK + "\n".join(rows)
@@ -46,6 +43,12 @@ def _join_lines(option_class: type) -> None:
 def _option_names(option_class: type) -> list[str]:
     """Names of the options of a class, without those of its groups of options."""
     return [field.name for field in fields(option_class) if field.default_factory is MISSING]
+
+
+def _attribute_texts(option_class: type) -> dict[str, str]:
+    from docstring_parser.attrdoc import AttributeDocstrings
+
+    return {name: text for name, (text, *_) in AttributeDocstrings().get_attr_docs(option_class).items() if text}
 
 
 def _argument_texts(option_class: type) -> dict[str, str]:
@@ -59,10 +62,10 @@ def _argument_texts(option_class: type) -> dict[str, str]:
 
     texts: dict[str, str] = {}
     for call in getattr(option_class, "calls", ()):
-        for argument in parse(call.__doc__ or "").params:
-            text = argument.description or ""
+        arguments = {each.arg_name: each.description or "" for each in parse(call.__doc__ or "").params}
+        for name, text in (arguments | (_attribute_texts(call) if isinstance(call, type) else {})).items():
             if not text.startswith("as for "):
-                texts.setdefault(argument.arg_name, re.sub("``(.*?)``", as_option, text[:1].upper() + text[1:]))
+                texts.setdefault(name, re.sub("``(.*?)``", as_option, text[:1].upper() + text[1:]))
     return texts
 
 

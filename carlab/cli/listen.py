@@ -4,48 +4,36 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from rich.text import Text
+from tyro.conf import arg
 
 from carlab.api.arguments import above_zero
 from carlab.cli.console import console, fail, readings_table
-from carlab.cli.options import arguments_of
+from carlab.cli.options import OF_CALL, arguments_of, options_of
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
 from carlab.experiment.episodes.interrupts import Interrupts
+from mocap.config import MocapConfig
 
 
 @dataclass
+@options_of(MocapConfig)
 class Listen:
     """Print motion-capture frames on arrival, and statistics: pose, rate, latency, losses."""
 
     car: Path | None = None
     """Car file with [hardware.mocap], which replaces the options below."""
 
-    server: str = "127.0.0.1"
-    """Address of the computer that runs Motive."""
-
-    interface: str = ""
-    """Address of this computer's interface to the server; empty: the system's choice."""
-
-    mode: Literal["unicast", "multicast"] = "unicast"
-    """Transmission type of the server."""
-
-    command_port: int = 1510
-    """NatNet command port of the server."""
-
-    body: str = ""
-    """Name of the rigid body; empty: the only one of the stream."""
-
-    body_id: int | None = None
-    """Streaming id of the rigid body, instead of its name."""
-
-    bitstream: str = "4.1"
-    """Newest bitstream version to request."""
-
-    up_axis: Literal["y", "z"] = "y"
-    """Up axis of the stream."""
+    server_address: Annotated[str, arg(name="server")] = OF_CALL
+    local_interface: Annotated[str, arg(name="interface")] = OF_CALL
+    mode: Literal["unicast", "multicast"] = OF_CALL
+    command_port: int = OF_CALL
+    body: str = OF_CALL
+    body_id: int | None = OF_CALL
+    bitstream: str = OF_CALL
+    up_axis: Literal["y", "z"] = OF_CALL
 
     seconds: float | None = None
     """Duration [s]; by default until ^C."""
@@ -56,11 +44,10 @@ class Listen:
     def run(self) -> int:
         """Print four frames per second and new problems of the poses, then the statistics and the last problems."""
         from carlab.cars import load_car_file
-        from mocap.config import MocapConfig
         from mocap.rigid_body import RigidBodyPoseSource
 
         above_zero(seconds=self.seconds)
-        config = MocapConfig(self.server, self.interface, **arguments_of(self, MocapConfig))
+        config = MocapConfig(**arguments_of(self, MocapConfig))
         if self.car is not None:
             real = load_car_file(self.car).real
             if real is None:

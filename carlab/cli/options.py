@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def options_of(*calls: Callable[..., Any]) -> Callable[[type[T]], type[T]]:
-    """Class decorator below ``@dataclass``: options are arguments of calls of the Python API.
+    """Class decorator below ``@dataclass``: options are arguments of functions of the Python API, or of dataclasses.
 
     An option whose value is ``OF_CALL`` has the default of the argument of its name. An option without a help text has
     the text of that argument (``carlab.cli.help_texts``). The first call with that argument counts.
