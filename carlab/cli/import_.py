@@ -5,26 +5,27 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from carlab.api.recordings import is_csv, required_file, resolved_mapping
 from carlab.cli.console import console
-from carlab.cli.options import new_file
+from carlab.cli.options import new_file, options_of
 from carlab.cli.recordings import print_findings
 from carlab.core.errors import ConfigError, DataError
 from carlab.recording.atomic_files import write_text
+from carlab.recording.column_mapping import ColumnMapping
 
 if TYPE_CHECKING:
     from carlab.recording.audit.report import AuditReport
-    from carlab.recording.column_mapping import ColumnMapping
 
 Sign = Literal[1, -1]
 OTHER_OPTIONS = ("recording", "out", "mapping", "report", "verbose")
 
 
 @dataclass
+@options_of(ColumnMapping)
 class Import:
     """Convert a CSV of another program (.csv, .csv.gz) to an MCAP recording, and report its data faults.
 
@@ -46,13 +47,8 @@ class Import:
     replaced."""
 
     velocity_frame: Literal["body", "world"] | None = None
-    """Frame of the velocity columns."""
-
-    velocity_lag: float | None = None
-    """Known delay of the velocity columns behind the pose [s]."""
-
+    velocity_lag_s: Annotated[float | None, arg(name="velocity-lag")] = None
     velocities: Literal["columns", "pose"] | None = None
-    """Take velocities from their columns, or estimate them from the pose."""
 
     t_unit: str | None = None
     """s, ms, us or ns."""
@@ -114,33 +110,15 @@ class Import:
     throttle_scale: float | None = None
     """Factor on throttle, to bring it into [-1, 1]."""
 
-    yaw_offset: float | None = None
-    """Added to yaw [rad]."""
-
+    yaw_offset_rad: Annotated[float | None, arg(name="yaw-offset")] = None
     swap_xy: bool | None = None
-    """Exchange x and y."""
-
     repair_yaw_rate: bool | None = None
-    """Replace spikes of a wrapped-angle difference by the yaw rate of the pose."""
-
     missing: Literal["error", "drop"] | None = None
-    """Rows with a missing value: error, or drop them."""
-
     gaps: Literal["error", "split", "keep"] | None = None
-    """Gaps in time: error, split into episodes, or keep one episode."""
-
     stamps: Literal["error", "drop"] | None = None
-    """Time stamps that do not increase: error, or drop those rows."""
-
     clock: Literal["column", "velocity", "even"] | None = None
-    """column: times of the time column. velocity: each period from distance over speed, for a synthetic time column.
-    even: a uniform clock, for camera frames with arrival times."""
-
-    command_lag: float | None = None
-    """Known delay of the command columns relative to the sending of the commands [s]."""
-
-    rate: float | None = None
-    """Row rate [Hz] of a file without a time column."""
+    command_lag_s: Annotated[float | None, arg(name="command-lag")] = None
+    rate_hz: Annotated[float | None, arg(name="rate")] = None
 
     verbose: bool = False
     """Show the whole log."""

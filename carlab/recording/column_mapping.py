@@ -102,13 +102,14 @@ class ColumnMapping:
     """Known delay of the velocity columns behind the pose [s]; world velocities are rotated by the yaw of that
     moment."""
     velocities: Literal["columns", "pose"] = "columns"
-    """``pose``: estimate velocities from the pose, centred, without delay; their columns are kept as extra."""
+    """Take velocities from their ``columns``, or estimate them from the ``pose``, centred, without delay; their columns
+    stay extra columns."""
     swap_xy: bool = False
     """Exchange x and y (and vx and vy in the world frame)."""
     yaw_offset_rad: float = 0.0
     """Added to yaw [rad] after unit and sign."""
     repair_yaw_rate: bool = False
-    """Replace rows of yaw_rate that hold a wrapped-angle spike by the turn rate of the pose."""
+    """Replace spikes of a wrapped-angle difference in the yaw rate by the yaw rate of the pose."""
     throttle_gate: str | None = None
     """Column that multiplied the throttle on the car: ``requested`` keeps the column, ``sent`` is the product."""
     references: Mapping[str, str] = field(default_factory=dict)
@@ -117,18 +118,18 @@ class ColumnMapping:
     dead_reckoning: bool = False
     """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
     clock: Literal["column", "velocity", "even"] = "column"
-    """``velocity``: rebuild each period from distance over speed, where the time column was constructed afterwards.
-    ``even``: rows are frames of a source of constant rate and the stamps are those of their arrival."""
+    """``column``: times of the time column. ``velocity``: each period from distance over speed, for a time column that
+    was constructed afterwards. ``even``: a uniform clock, for frames of constant rate with times of arrival."""
     command_lag_s: float = 0.0
     """Known delay of the command columns behind the moment at which the commands were sent [s]."""
     rate_hz: float | None = None
     """Row rate [Hz] of a file without a time column."""
     missing: Literal["error", "drop"] = "error"
-    """Rows with a value missing: refuse, or leave them out (the command before is then held across them)."""
+    """Rows with a missing value: ``error``, or ``drop`` them (the command before is then held across them)."""
     gaps: Literal["error", "split", "keep"] = "error"
-    """Gaps in time: refuse, split into episodes there and where the pose jumps, or keep one episode."""
+    """Gaps in time: ``error``, ``split`` into episodes there and where the pose jumps, or ``keep`` one episode."""
     stamps: Literal["error", "drop"] = "error"
-    """Stamps that do not increase: refuse, or leave those rows out."""
+    """Time stamps that do not increase: ``error``, or ``drop`` those rows."""
 
     def __post_init__(self) -> None:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
