@@ -130,7 +130,7 @@ def load_car_file(path: Path) -> CarFile:
     check_keys(tables, (*TABLES, "hardware", "recording_noise", "track"), str(path))
     noise = tables.pop("recording_noise", None)
     if noise is not None:
-        noise = RecordingNoise.from_table(noise, f"[recording_noise] of {path}")
+        noise = from_table(RecordingNoise, noise, f"[recording_noise] of {path}")
     hardware, track = tables.pop("hardware", None), tables.pop("track", None)
     simulator = SimulatorConfig.from_tables(tables, str(path))
     real = None if hardware is None else _real_car(hardware, path)

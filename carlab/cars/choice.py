@@ -6,6 +6,7 @@ import importlib.metadata
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -215,10 +216,6 @@ def _emulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None, ac
     )
 
 
-def _emulated_can(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
-    return _emulated(file, seed, truth, "can")
-
-
 def _real(file: CarFile, seed: int) -> CarChoice:
     from carlab.core.state_estimator import StateEstimator
     from drivers.actuator import Actuator
@@ -267,5 +264,5 @@ def _envelope(file: CarFile) -> SafetyEnvelope:
 BUILT_IN: dict[str, Callable[[CarFile, int, SimulatorConfig | None], CarChoice]] = {
     "sim": _simulated,
     "emulated": _emulated,
-    "emulated-can": _emulated_can,
+    "emulated-can": partial(_emulated, actuator="can"),
 }

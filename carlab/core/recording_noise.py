@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import STATE_NAMES
-from carlab.core.tables import from_table
 
 StateStd = tuple[float, float, float, float, float, float]
 FeatureStd = tuple[float, float, float, float, float, float, float]
@@ -75,11 +73,6 @@ class RecordingNoise:
             raise ConfigError(
                 f"velocity_window_s2 in [recording_noise] is {self.velocity_window_s2:g}; it must be from 0 to 1 s2."
             )
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any], where: str) -> RecordingNoise:
-        """Read the table. Raises ConfigError for an unknown or missing key, or a value out of range."""
-        return from_table(cls, table, where)
 
     def floor_after(self, horizon_s: float) -> StateStd | None:
         """The noise floor after a horizon; None if it is that of another horizon."""
