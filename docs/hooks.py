@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import inspect
 import io
-import itertools
 import json
 import os
 import re
@@ -123,8 +121,10 @@ def _tables_of_hardware() -> str:
 
 def _table_of_hardware(name: str, cls: type) -> str:
     """Text of a table of ``[hardware]``, and its keys with their default values."""
+    from carlab.cli.help_texts import attribute_texts
+
     text = (inspect.getdoc(cls) or "").split("\n\nRaises:")[0]
-    meanings = _meanings(cls)
+    meanings = attribute_texts(cls)
     rows = [
         f"| `{field.name}` | `{_toml(field.default)}` |" + (f" {meanings.get(field.name, '')} |" if meanings else "")
         for field in dataclasses.fields(cls)
@@ -134,17 +134,6 @@ def _table_of_hardware(name: str, cls: type) -> str:
     if meanings:
         head = "| key | default | meaning |\n| --- | --- | --- |"
     return "\n".join([f"### `[hardware.{name}]`\n\n{text}\n\n{head}", *rows, ""])
-
-
-def _meanings(cls: type) -> dict[str, str]:
-    """The text after each attribute of a class that has one."""
-    body = ast.parse(inspect.getsource(cls)).body[0]
-    assert isinstance(body, ast.ClassDef)
-    return {
-        field.target.id: ast.literal_eval(text.value)
-        for field, text in itertools.pairwise(body.body)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr)
-    }
 
 
 def _toml(value: Any) -> str:

@@ -34,7 +34,7 @@ def _join_lines(option_class: type) -> None:
     Therefore this function copies the texts into such a section.
     """
     summary = inspect.getdoc(option_class) or ""
-    texts = _argument_texts(option_class) | _attribute_texts(option_class)
+    texts = _argument_texts(option_class) | attribute_texts(option_class)
     rows = [f"    {name}: {' '.join(texts[name].split())}" for name in _option_names(option_class) if name in texts]
     if rows and MARK not in summary:
         option_class.__doc__ = summary + MARK + "\n".join(rows)
@@ -45,7 +45,8 @@ def _option_names(option_class: type) -> list[str]:
     return [field.name for field in fields(option_class) if field.default_factory is MISSING]
 
 
-def _attribute_texts(option_class: type) -> dict[str, str]:
+def attribute_texts(option_class: type) -> dict[str, str]:
+    """The text after each attribute of a class that has one."""
     from docstring_parser.attrdoc import AttributeDocstrings
 
     return {name: text for name, (text, *_) in AttributeDocstrings().get_attr_docs(option_class).items() if text}
@@ -63,7 +64,7 @@ def _argument_texts(option_class: type) -> dict[str, str]:
     texts: dict[str, str] = {}
     for call in getattr(option_class, "calls", ()):
         arguments = {each.arg_name: each.description or "" for each in parse(call.__doc__ or "").params}
-        for name, text in (arguments | (_attribute_texts(call) if isinstance(call, type) else {})).items():
+        for name, text in (arguments | (attribute_texts(call) if isinstance(call, type) else {})).items():
             if not text.startswith("as for "):
                 texts.setdefault(name, re.sub("``(.*?)``", as_option, text[:1].upper() + text[1:]))
     return texts
