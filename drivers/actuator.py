@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import math
 import os
 import threading
@@ -18,6 +19,8 @@ from drivers.sender.logic import Order, Request, SenderState
 from drivers.sender.process import Sender, start_sender
 from drivers.sender.status import SenderStatus
 from drivers.sender.timeout_measurement import MAX_TIMEOUT_S
+
+_log = logging.getLogger(__name__)
 
 START_TIMEOUT_S = 15.0
 ANSWER_TIMEOUT_S = 2.0
@@ -149,20 +152,27 @@ class Actuator(Resource):
         """Send neutral and disarm; ``planned=False`` latches a fault. Returns after three neutral frames.
 
         Does nothing if the actuator is closed or the sender has ended. Waits two seconds at most, and not at all for
-        a sender that hangs: the order stays in its slot, and the sender executes it when it resumes.
+        a sender that hangs: the order stays in its slot, and the sender executes it when it resumes. Logs a warning if
+        a planned stop of an armed actuator fails; after another stop the fault is known.
         """
         if not self.is_open or not self._is_sender_alive():
             return
         with self._lock:
             if not planned:
                 self._latched = self._latched or SAFETY_STOP
+            is_armed = self._armed_epoch == self._epoch > 0
             epoch = self._post_request(Request.STOP if planned else Request.STOP_AND_LATCH)
 
         def is_over(status: SenderStatus) -> bool:
             is_neutral = status.epoch >= epoch and (status.is_neutral_settled or not status.is_sending)
             return status.is_ended or is_neutral or _hangs(status)
 
-        self._await(is_over, ANSWER_TIMEOUT_S)
+        status = self._await(is_over, ANSWER_TIMEOUT_S)
+        if planned and is_armed and not status.is_neutral_settled:
+            name, cause = self.config.device_kind.name, status.fault or "the sender process does not answer."
+            _log.warning(
+                "Neutral may not have arrived at the stop; then the %s's own time-out stops the motor: %s", name, cause
+            )
 
     def reset_fault(self) -> None:
         """Clear a latched fault; the actuator stays disarmed.

@@ -211,6 +211,23 @@ def test_replugged_device_gets_neutral_until_reset_and_arm(serial_firmware: Seri
         until(lambda: any(e.value == 3.0 for e in serial_firmware.log.motor(t_replug_s)))
 
 
+def test_planned_stop_without_a_link_gives_a_warning(
+    actuator: Actuator, serial_firmware: SerialFirmware, caplog: pytest.LogCaptureFixture
+) -> None:
+    actuator.arm()
+    actuator.stop(planned=True)
+    actuator.arm()
+    actuator.command(MOVING)
+    assert caplog.text == ""
+    serial_firmware.unplug()
+    actuator.stop(planned=True)
+    assert "Neutral may not have arrived at the stop; then the VESC's own time-out stops the motor: " in caplog.text
+    assert "was lost" in caplog.text
+    assert len(caplog.records) == 1
+    actuator.stop(planned=True)
+    assert len(caplog.records) == 1
+
+
 def test_another_board_on_the_same_port_is_not_used(serial_firmware: SerialFirmware) -> None:
     with Actuator(config_for(serial_firmware), CALIBRATION) as actuator:
         serial_firmware.unplug()
