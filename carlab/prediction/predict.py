@@ -20,7 +20,8 @@ from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.array_rollout import array_rollout
 from sim_backends.batch.inputs import with_effects_of_values
-from sim_backends.batch.rollout import Engine, operator_rollout
+from sim_backends.batch.operator_rollout import operator_rollout
+from sim_backends.batch.rollout import Engine
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, DynamicsEffect
 from sim_backends.measurement import (

@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from sim_backends.array_ops import ARRAYS, Value
-from sim_backends.batch.inputs import as_array, total_delays_s
-from sim_backends.batch.schedule import PeriodPlan, Piece, plan_period
+from sim_backends.batch.inputs import Past, as_array, total_delays_s
+from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
+from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.advance import BODY_ROWS, Key, address, advance_rows, segment_table, trace_step
 from sim_backends.compiled.machine_code import FloatRow, vector_length
 from sim_backends.dynamics.actuators import ActuatorChain
@@ -76,6 +77,32 @@ def array_rollout(
     return ends[:-1, :BODY_ROWS, :cars]
 
 
+def rollout_of_tensors(
+    config: SimulatorConfig,
+    start: torch.Tensor,
+    commands: torch.Tensor,
+    past: Past | None,
+    given: Mapping[str, Number],
+    t0_s: Number,
+    max_step_s: float,
+) -> torch.Tensor:
+    """States (N, T + 1, 6) of a rollout without a gradient, by compiled code on arrays."""
+    earlier = commands.new_zeros(len(start), 1, 2) if past is None else past.commands
+    states = array_rollout(
+        config.kind,
+        config.effects,
+        {**config.values(), **{name: as_array(value) for name, value in given.items()}},
+        as_array(start.T.contiguous()),
+        as_array(torch.cat([earlier, commands], dim=1).permute(2, 1, 0).contiguous()),
+        int(commands.shape[1]),
+        before=0 if past is None else int(earlier.shape[1]),
+        past_states=None if past is None or past.states is None else as_array(past.states.permute(1, 2, 0)),
+        t0_s=as_array(t0_s),
+        max_step_s=max_step_s,
+    )
+    return torch.from_numpy(states).permute(2, 0, 1)
+
+
 class _ArrayRollout:
     def __init__(
         self,
@@ -92,8 +119,8 @@ class _ArrayRollout:
         self.kind, self.effects = kind, tuple(effects)
         self.period_s = float(numbers["timing.control_period"])
         self.key = Key.of(kind, self.effects)
-        rows = {name: torch.from_numpy(v) for name, v in numbers.items() if isinstance(v, np.ndarray)}
-        delays_s = total_delays_s({**numbers, **rows}, self.effects)
+        as_tensors = {n: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for n, v in numbers.items()}
+        delays_s = total_delays_s(as_tensors, self.effects)
         self.plan: PeriodPlan = plan_period(self.period_s, delays_s, 0.0, max_step_s)
 
     def carried_at_start(self, start: FloatRow, past_states: FloatRow | None, before: int) -> FloatRow:

@@ -7,19 +7,17 @@ the cars are simulated in chunks that fit the cache. On a GPU, and for second de
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 
 from carlab.core.planar import arc
 from sim_backends.array_ops import Value
-from sim_backends.batch.array_rollout import array_rollout
+from sim_backends.batch.array_rollout import rollout_of_tensors
 from sim_backends.batch.inputs import (
     Past,
-    as_array,
     check_shapes,
     check_values,
     number_if_shared,
@@ -29,12 +27,10 @@ from sim_backends.batch.inputs import (
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.advance import Key, advance_tensors, trace_step
-from sim_backends.compiled.machine_code import FloatRow
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops
-from sim_backends.effects.base import ModelKind
 from sim_backends.measurement import MeasurementModel, filter_step
 
 CARS_AT_ONCE = 4096
@@ -100,90 +96,22 @@ def rollout(
     given = dict(values or {})
     check_values(given, t0_s, cars)
     config = with_effects_of_values(config, given)
-    tensors = [start, commands, t0_s, *(past or ()), *given.values()]
-    needs_gradient = torch.is_grad_enabled() and any(isinstance(t, torch.Tensor) and t.requires_grad for t in tensors)
+    inputs = [start, commands, t0_s, *(past or ()), *given.values()]
+    needs_gradient = torch.is_grad_enabled() and any(isinstance(v, torch.Tensor) and v.requires_grad for v in inputs)
     may_compile = engine == "fastest" and start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
     if needs_gradient:
         return _Batch(config, start, commands, past, given, t0_s, max_step_s, may_compile).run(measured)
-    cars_at_once = CARS_AT_ONCE if start.device.type == "cpu" else max(cars, 1)
-    parts = []
+    at_once, parts = CARS_AT_ONCE if start.device.type == "cpu" else max(cars, 1), []
     with torch.no_grad():
-        for first in range(0, max(cars, 1), cars_at_once):
-            cut = slice(first, first + cars_at_once)
+        for first in range(0, max(cars, 1), at_once):
+            cut = slice(first, first + at_once)
             own = {name: _of_cars(value, cut) for name, value in given.items()}
-            earlier = None if past is None else past.cut(cut)
-            chunk = (start[cut], commands[cut], earlier, own, _of_cars(t0_s, cut), max_step_s)
-            if may_compile and not measured and cars:
-                parts.append(Rollout(_on_arrays(config, *chunk)))
-            else:
-                parts.append(_Batch(config, *chunk, may_compile).run(measured))
+            chunk = (start[cut], commands[cut], past and past.cut(cut), own, _of_cars(t0_s, cut), max_step_s)
+            if may_compile and cars and not measured:
+                parts.append(Rollout(rollout_of_tensors(config, *chunk)))
+                continue
+            parts.append(_Batch(config, *chunk, may_compile).run(measured))
     return _joined(parts)
-
-
-def _on_arrays(
-    config: SimulatorConfig,
-    start: torch.Tensor,
-    commands: torch.Tensor,
-    past: Past | None,
-    given: Mapping[str, Number],
-    t0_s: Number,
-    max_step_s: float,
-) -> torch.Tensor:
-    """States (N, T + 1, 6) of a rollout without a gradient, by compiled code on arrays."""
-    earlier = commands.new_zeros(len(start), 1, 2) if past is None else past.commands
-    states = array_rollout(
-        config.kind,
-        config.effects,
-        {**config.values(), **{name: as_array(value) for name, value in given.items()}},
-        as_array(start.T.contiguous()),
-        as_array(torch.cat([earlier, commands], dim=1).permute(2, 1, 0).contiguous()),
-        int(commands.shape[1]),
-        before=0 if past is None else int(earlier.shape[1]),
-        past_states=None if past is None or past.states is None else as_array(past.states.permute(1, 2, 0)),
-        t0_s=as_array(t0_s),
-        max_step_s=max_step_s,
-    )
-    return torch.from_numpy(states).permute(2, 0, 1)
-
-
-def operator_rollout(
-    kind: ModelKind,
-    effects: Iterable[str],
-    numbers: Mapping[str, Number],
-    start: FloatRow,
-    commands: FloatRow,
-    ticks: int,
-    *,
-    before: int,
-    past_states: FloatRow | None,
-    t0_s: FloatRow,
-    max_step_s: float,
-    every: int = 1,
-) -> FloatRow:
-    """``array_rollout`` by torch's operators, for ``report_evaluations``; all rows before the first tick are used."""
-    given = {name: torch.as_tensor(value, dtype=torch.from_numpy(start).dtype) for name, value in numbers.items()}
-    period_s = float(given.pop("timing.control_period"))
-    config = SimulatorConfig(kind=kind, effects={name: {} for name in effects}, control_period_s=period_s)
-    rows = torch.from_numpy(commands).permute(2, 1, 0)
-    states = rollout(
-        config,
-        torch.from_numpy(start).T,
-        rows[:, before:],
-        history=rows[:, :before],
-        history_states=None if past_states is None else _at_each_tick(past_states, start, every),
-        values=given,
-        t0_s=torch.from_numpy(t0_s),
-        max_step_s=max_step_s,
-        engine="operators",
-    ).states
-    return states[:, ::every].permute(1, 2, 0).numpy()
-
-
-def _at_each_tick(past_states: FloatRow, start: FloatRow, every: int) -> torch.Tensor:
-    """States (N, H every, 6) at each tick, linear between every-th states (H, 6, N) and the start (6, N)."""
-    change = np.diff(past_states, axis=0, append=start[None])[:, None]
-    states = past_states[:, None] + change * np.arange(every)[:, None, None] / every
-    return torch.from_numpy(states.reshape(-1, *start.shape)).permute(2, 0, 1)
 
 
 def _of_cars(value: Number, cars: slice) -> Number:
