@@ -62,6 +62,8 @@ def array_rollout(
         States (T // every + 1, 6, N): true x, y [m], yaw [rad] (not wrapped), vx, vy [m/s], yaw rate [rad/s].
     """
     cars, least = start.shape[1], vector_length(start.dtype)
+    if not cars:
+        return np.empty((ticks // every + 1, BODY_ROWS, 0), start.dtype)
     if cars < least:
         again = np.arange(least) % cars
         numbers = {name: v[again] if isinstance(v, np.ndarray) else v for name, v in numbers.items()}
