@@ -136,7 +136,7 @@ def test_verb_without_a_verdict_has_the_exit_code_of_a_diagnosis_without_one(fir
     assert run(arguments) == EXIT_INCONCLUSIVE == Inconclusive.exit_code
     assert "second group has 20 s of driving" in " ".join(capsys.readouterr().err.split())
     undecided = Comparison("inconclusive", "The comparison was stopped.", is_complete=False)
-    monkeypatch.setattr("carlab.api.compare", lambda *arguments, **options: undecided)
+    monkeypatch.setattr("carlab.cli.compare.compare", lambda *arguments, **options: undecided)
     assert run(arguments) == EXIT_INCONCLUSIVE
     assert undecided.sentence in capsys.readouterr().err
 

@@ -105,27 +105,27 @@ def test_fit_with_estimated_initial_states_decides_nothing(scored: ScoredSearch)
     assert without_uncertain_effects(estimated, RunControl()) is estimated
 
 
-@pytest.mark.parametrize(
-    ("seed", "stands"), [(7, False), (8, False), (17, False), (10, True), (12, True), (4, True), (6, True)]
-)
-def test_effect_that_raises_both_held_out_errors_is_withdrawn(scored: ScoredSearch, seed: int, stands: bool) -> None:
+def test_effects_that_raise_both_held_out_errors_are_withdrawn(scored: ScoredSearch) -> None:
     """The rms error and Huber's loss decide on drives of the same car, which does not have the effect."""
     true = replace(CAR, effects={LAG: {"time_constant": 0.05}})
-    windows = cut_windows(segments_of([drive(true, 30.0, seed)]), 0.8, 0.5)
     problem, scale = scored.problem, scored.found.scale
     best = refit(problem, (LAG, BRAKE), problem.fitter(scale).fit(CAR, ()), scale).fit
-    found = replace(scored.found, best=best)
     without = refit(problem, (LAG,), best, scale).fit
-    before, after = (
-        prediction_errors(simulate_windows(windows, fit.config), windows)[0, :, -1] for fit in (without, best)
-    )
-    is_larger = np.mean((after / STD) ** 2) >= np.mean((before / STD) ** 2)
-    robust = np.maximum(1.4826 * np.median(np.abs(after), axis=0), 3.0 * STD)
-    loss_before, loss_after = (huber_loss(4.0, each / robust).sum() for each in (before, after))
-    assert stands == (not is_larger or loss_after < loss_before)
-    held_out = HeldOut(windows, 3.0 * STD, Noise(STD, STD))
-    confirmed = without_harmful_effects(problem, found, held_out, RunControl())
-    assert confirmed.effects == ((LAG, BRAKE) if stands else (LAG,))
+    outcomes = []
+    for seed in (4, 6, 7, 8, 10, 12, 17):
+        windows = cut_windows(segments_of([drive(true, 30.0, seed)]), 0.8, 0.5)
+        before, after = (
+            prediction_errors(simulate_windows(windows, fit.config), windows)[0, :, -1] for fit in (without, best)
+        )
+        is_larger = np.mean((after / STD) ** 2) >= np.mean((before / STD) ** 2)
+        robust = np.maximum(1.4826 * np.median(np.abs(after), axis=0), 3.0 * STD)
+        loss_before, loss_after = (huber_loss(4.0, each / robust).sum() for each in (before, after))
+        stands = not is_larger or loss_after < loss_before
+        held_out = HeldOut(windows, 3.0 * STD, Noise(STD, STD))
+        confirmed = without_harmful_effects(problem, replace(scored.found, best=best), held_out, RunControl())
+        assert confirmed.effects == ((LAG, BRAKE) if stands else (LAG,))
+        outcomes.append(stands)
+    assert min(outcomes.count(True), outcomes.count(False)) >= 2
 
 
 def test_remaining_effects_have_the_fit_that_was_judged(scored: ScoredSearch) -> None:
