@@ -1,9 +1,12 @@
-"""Covariance of fitted parameters by the jackknife over blocks.
+"""Covariance of fitted parameters by blocks of the recording.
 
 Errors of a block are dependent, so blocks count as independent, not rows. A few blocks, such as those with slides,
 determine some parameters. The usual sandwich estimate (White 1980; Liang and Zeger 1986) ignores how strongly a fit
-follows such blocks, and is too small. Here each block is left out by one Gauss-Newton step (the estimator CR3 of Bell
-and McCaffrey 2002).
+follows such blocks, and is too small. The jackknife leaves each block out by one Gauss-Newton step (the estimator CR3
+of Bell and McCaffrey 2002).
+
+Standard errors come from the jackknife. The tests of a search divide gains by design effects of the sandwich estimate,
+with which their limits were chosen (docs/decisions/0037).
 """
 
 from __future__ import annotations
@@ -16,28 +19,30 @@ from scipy import stats
 from carlab.core.quantities import FloatArray
 
 
-def jackknife_covariance(
-    information: FloatArray, scores: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Covariance of n parameters, and its diagonal over that for independent errors.
+def jackknife_covariance(information: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:
+    """Covariance (n, n) of n parameters; that for independent errors if there is a single block.
 
     Args:
         information: (B, n, n) Gauss-Newton matrix of each block, without the prior.
         scores: (B, n) gradient of each block's loss.
         precision: (n, n) of the prior.
-
-    Returns:
-        (n, n) and (n,). The errors of a single block count as independent.
     """
     normal = information.sum(axis=0) + precision
-    independent = np.asarray(np.linalg.pinv(normal), dtype=np.float64)
     count = len(information)
     if count == 1:
-        return independent, np.ones(len(independent))
+        return np.asarray(np.linalg.pinv(normal), dtype=np.float64)
     pairs = zip(information, scores, strict=True)
     changes = np.array([np.linalg.lstsq(normal - own, score, rcond=None)[0] for own, score in pairs])
-    covariance = (count - 1) / count * changes.T @ changes
-    return covariance, np.diag(covariance) / np.maximum(np.diag(independent), 1e-30)
+    return np.asarray((count - 1) / count * changes.T @ changes)
+
+
+def sandwich_design_effects(information: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:
+    """Variance (n,) by the sandwich estimate over that for independent errors; arguments as above."""
+    independent = np.linalg.pinv(information.sum(axis=0) + precision)
+    count = len(information)
+    changes = scores @ independent
+    variance = count / max(count - 1, 1) * (changes**2).sum(axis=0)
+    return np.asarray(variance / np.maximum(np.diag(independent), 1e-30))
 
 
 def interval_quantile(blocks: int, probability: float) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
-from carlab.diagnosis.identification.block_jackknife import jackknife_covariance
+from carlab.diagnosis.identification.block_jackknife import jackknife_covariance, sandwich_design_effects
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
@@ -97,7 +97,7 @@ class Fit:
         cost: Huber loss plus prior.
         loss: (S,) Huber loss of each window.
         covariance: (n, n) covariance of z by the jackknife over blocks.
-        design_effects: (n,) diagonal of ``covariance`` over that for independent errors.
+        design_effects: (n,) variance of z by the sandwich estimate over blocks, over that for independent errors.
     """
 
     config: SimulatorConfig
@@ -291,8 +291,10 @@ class Fitter:
         parts = [self._information(jacobian[:, own], white[own]) for own in owns]
         scores = np.array([score.sum(axis=1) for _, score in parts])
         information = np.array([own for own, _ in parts])
-        covariance, design_effects = jackknife_covariance(information, scores, self.precision(fit.free))
-        return replace(fit, covariance=covariance, design_effects=design_effects)
+        arguments = information, scores, self.precision(fit.free)
+        return replace(
+            fit, covariance=jackknife_covariance(*arguments), design_effects=sandwich_design_effects(*arguments)
+        )
 
     def gauss_newton_step(self, fit: Fit, linearisation: Linearisation) -> FloatArray:
         """Change (n,) of the coordinates of a fit that minimises the linearised loss with its prior."""

@@ -148,15 +148,15 @@ def _result(problem: _Problem, point: _Point, precision: FloatArray) -> Fit:
     """The fit with the covariance of its parameters."""
     fitter, free, z = problem.fitter, problem.free, point.z
     at = problem.linearised(z, point.states)
-    covariance, design_effects = _covariance(at, fitter.windows.block, precision)
+    covariance = _covariance(at, fitter.windows.block, precision)
     config = problem.config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
     loss = fitter.loss(config)
     cost = float(loss.sum() + fitter.prior(free, z[None])[0])
-    return Fit(config, free, z, cost, loss, covariance, design_effects)
+    return Fit(config, free, z, cost, loss, covariance)
 
 
-def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariance (n, n) by the jackknife over blocks, and its diagonal over that for independent errors (n,)."""
+def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) -> FloatArray:
+    """Covariance (n, n) by the jackknife over blocks."""
     jacobian = at.projected()[0]
     parts = [
         _normal(jacobian[own], replace(at, white=at.white[own], weights=at.weights[own]))
