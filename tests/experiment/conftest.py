@@ -1,8 +1,10 @@
-"""A run that trained before two episodes, for the tests of training on a cluster."""
+"""A run that trained before two episodes, for the tests of training on a cluster, and signals that are not ignored."""
 
 from __future__ import annotations
 
 import shutil
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,14 @@ from carlab.experiment.campaign.training import train
 from carlab.experiment.cluster.order import TrainingOrder
 from carlab.jobs.child_jobs import write_files
 from carlab.recording.run_folder import RunDirectory
+
+
+@pytest.fixture
+def default_hangup() -> Iterator[None]:
+    """SIGHUP has its default action in this process and its children, also if nohup started the tests."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture(scope="module")

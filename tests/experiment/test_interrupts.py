@@ -15,6 +15,7 @@ from carlab.experiment.episodes.interrupts import SIGNALS, Flag, Interrupts, Loo
 TIMEOUT_S = 20.0
 
 
+@pytest.mark.usefixtures("default_hangup")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_first_signal_requests_a_stop_and_second_one_is_urgent(number: signal.Signals) -> None:
     before = signal.getsignal(number)

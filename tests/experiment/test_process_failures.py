@@ -110,6 +110,7 @@ def assert_neutral_at_the_end(log: list[LogEntry], min_commands: int = 3, min_du
     assert servo[-1].value == pytest.approx(0.5)
 
 
+@pytest.mark.usefixtures("default_hangup")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_ends_the_episode_with_stop_requested(tmp_path: Path, number: signal.Signals) -> None:
     with driving(tmp_path, "well_behaved") as program:
