@@ -77,7 +77,7 @@ def drive(
         name: last part of the run folder's name.
         rerun: also record .rrd files.
         picture: draw summary.png.
-        live: open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it.
+        live: open the rerun viewer, which follows the run. A slow viewer loses data; the car does not wait for it.
         viewer: address of an open rerun viewer that follows the run, on any computer: ``rerun+http://HOST:9876/proxy``.
         vehicle: car file with physics and motion capture of ``sim`` and ``emulated``, which replaces the default car.
         reality: car file with the true physics of a simulated or emulated car, unlike the file of ``car`` or

@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes
 
 from carlab.api.checking import check
 from carlab.cli.console import banner, console, fail, readings_table, table
-from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
+from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.core.errors import NotReadyError
 from carlab.experiment.episodes.hooks import RunHooks
 
@@ -30,8 +30,8 @@ class Check:
 
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    seconds: float = OF_CALL
-    wheels: bool = OF_CALL
+    seconds: float = ARGUMENT_DEFAULT
+    wheels: bool = ARGUMENT_DEFAULT
 
     verbose: bool = False
     """Show the whole log."""

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from carlab.api.comparison import compare
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
-from carlab.cli.options import OF_CALL, arguments_of, options_of, report_folder
+from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of, report_folder
 from carlab.cli.runs import search_callbacks
 
 
@@ -32,8 +32,8 @@ class Compare:
     changed: Annotated[tuple[Path, ...], arg(name="with")] = ()
     """Recordings of the second group."""
 
-    car: str = OF_CALL
-    candidates: tuple[str, ...] = OF_CALL
+    car: str = ARGUMENT_DEFAULT
+    candidates: tuple[str, ...] = ARGUMENT_DEFAULT
 
     out: Path = Path("comparison")
     """Folder for compare.json; an earlier compare.json in it is replaced."""

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from carlab.api.diagnosis import diagnose
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
-from carlab.cli.options import OF_CALL, arguments_of, options_of, report_folder
+from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of, report_folder
 from carlab.cli.recordings import print_errors
 from carlab.cli.runs import search_callbacks
 
@@ -32,22 +32,22 @@ class Diagnose:
     recordings: Positional[tuple[Path, ...]]
     """MCAP or CSV files to fit, or run folders. Every third episode of a run folder is held out."""
 
-    car: str = OF_CALL
-    held_out: Annotated[tuple[Path, ...], arg(aliases=("--holdout",))] = OF_CALL
-    holdout_share: float | None = OF_CALL
+    car: str = ARGUMENT_DEFAULT
+    held_out: Annotated[tuple[Path, ...], arg(aliases=("--holdout",))] = ARGUMENT_DEFAULT
+    holdout_share: float | None = ARGUMENT_DEFAULT
 
     out: Path = Path("diagnosis")
     """Folder for the report; an earlier report in it is replaced."""
 
-    budget_s: Annotated[float, arg(name="budget")] = OF_CALL
-    jobs: int | None = OF_CALL
-    effects: tuple[str, ...] = OF_CALL
-    curves: bool = OF_CALL
-    ceiling: bool = OF_CALL
-    adapt: bool = OF_CALL
-    keep_events: bool = OF_CALL
-    discrepancy: bool = OF_CALL
-    seed: int = OF_CALL
+    budget_s: Annotated[float, arg(name="budget")] = ARGUMENT_DEFAULT
+    jobs: int | None = ARGUMENT_DEFAULT
+    effects: tuple[str, ...] = ARGUMENT_DEFAULT
+    curves: bool = ARGUMENT_DEFAULT
+    ceiling: bool = ARGUMENT_DEFAULT
+    adapt: bool = ARGUMENT_DEFAULT
+    keep_events: bool = ARGUMENT_DEFAULT
+    discrepancy: bool = ARGUMENT_DEFAULT
+    seed: int = ARGUMENT_DEFAULT
 
     decisions: bool = False
     """Also write decisions.json: the statistics and thresholds of each decision about an effect."""

@@ -15,7 +15,7 @@ from carlab.api.driving import drive
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
+from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
 from carlab.core.documents import Tick
 from carlab.core.outcome import EndReason
@@ -38,23 +38,23 @@ class Drive:
 
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    policy: str = OF_CALL
+    policy: str = ARGUMENT_DEFAULT
     """parking (feedback), excitation (random commands inside the arena, for a diagnosis), neutral (no motion), keyboard
     or gamepad (hold the dead-man control), a scripted manoeuvre (steering_steps, throttle_steps, steering_chirp,
     figure_eight, throttle_ramp, coast_down, slow_circle), or the run folder of carlab learn: its newest policy
     (RUN/models/0003: the policy of episode 3)."""
 
-    episodes: int = OF_CALL
-    ticks: int | None = OF_CALL
-    seed: int = OF_CALL
-    max_throttle: float | None = OF_CALL
-    place: bool = OF_CALL
-    out: Path = OF_CALL
-    name: str = OF_CALL
-    rerun: bool = OF_CALL
-    live: bool = OF_CALL
-    viewer: str | None = OF_CALL
-    picture: bool = OF_CALL
+    episodes: int = ARGUMENT_DEFAULT
+    ticks: int | None = ARGUMENT_DEFAULT
+    seed: int = ARGUMENT_DEFAULT
+    max_throttle: float | None = ARGUMENT_DEFAULT
+    place: bool = ARGUMENT_DEFAULT
+    out: Path = ARGUMENT_DEFAULT
+    name: str = ARGUMENT_DEFAULT
+    rerun: bool = ARGUMENT_DEFAULT
+    live: bool = ARGUMENT_DEFAULT
+    viewer: str | None = ARGUMENT_DEFAULT
+    picture: bool = ARGUMENT_DEFAULT
 
     verbose: bool = False
     """Show the whole log."""

@@ -18,7 +18,7 @@ from carlab.api.learning import learn
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import OF_CALL, CarOptions, TaskOptions, arguments_of, options_of
+from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
 from carlab.core.documents import Tick
 from carlab.experiment.campaign.hooks import LearnHooks
@@ -67,38 +67,38 @@ class Learn:
 
     task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    episodes: int | None = OF_CALL
-    ticks: int | None = OF_CALL
+    episodes: int | None = ARGUMENT_DEFAULT
+    ticks: int | None = ARGUMENT_DEFAULT
 
-    prior: str | None = OF_CALL
+    prior: str | None = ARGUMENT_DEFAULT
     """The prior simulator: kinematic (the default: the car file without wheel slip), nominal (the car file), auto, or
     FILE.toml (for example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and
     parameters that the recordings support are added to the prior, and those that they contradict are removed; the run
     prints each change. Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle
     lie within 30 % of their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
 
-    method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = OF_CALL
-    history: int | None = OF_CALL
-    model_steps: int | None = OF_CALL
-    updates: int | None = OF_CALL
-    seed: int | None = OF_CALL
-    device: Device | None = OF_CALL
+    method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = ARGUMENT_DEFAULT
+    history: int | None = ARGUMENT_DEFAULT
+    model_steps: int | None = ARGUMENT_DEFAULT
+    updates: int | None = ARGUMENT_DEFAULT
+    seed: int | None = ARGUMENT_DEFAULT
+    device: Device | None = ARGUMENT_DEFAULT
 
-    ray: str = OF_CALL
+    ray: str = ARGUMENT_DEFAULT
     """Train on Ray while the car stays with this computer: local, or the address of a cluster (ray://HOST:10001) with
     the same version of carlab, for example a computer with a GPU (--device cuda). While the cluster does not answer,
     the car stays in neutral and the run waits (--ray-wait). Then the run trains on this computer, and tries the cluster
     again before the next episode. Needs the extra ray of carlab (see "Run on a Ray
     cluster")."""
 
-    ray_wait: float = OF_CALL
-    place: bool | None = OF_CALL
-    resume: Path | None = OF_CALL
-    out: Path | None = OF_CALL
-    name: str | None = OF_CALL
-    rerun: bool | None = OF_CALL
-    live: bool = OF_CALL
-    viewer: str | None = OF_CALL
+    ray_wait: float = ARGUMENT_DEFAULT
+    place: bool | None = ARGUMENT_DEFAULT
+    resume: Path | None = ARGUMENT_DEFAULT
+    out: Path | None = ARGUMENT_DEFAULT
+    name: str | None = ARGUMENT_DEFAULT
+    rerun: bool | None = ARGUMENT_DEFAULT
+    live: bool = ARGUMENT_DEFAULT
+    viewer: str | None = ARGUMENT_DEFAULT
 
     verbose: bool = False
     """Show the whole log."""

@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from carlab.api.arguments import above_zero
 from carlab.cli.console import console, fail, readings_table
-from carlab.cli.options import OF_CALL, arguments_of, options_of
+from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
 from carlab.experiment.episodes.interrupts import Interrupts
@@ -26,14 +26,14 @@ class Listen:
     car: Path | None = None
     """Car file with [hardware.mocap], which replaces the options below."""
 
-    server_address: Annotated[str, arg(name="server")] = OF_CALL
-    local_interface: Annotated[str, arg(name="interface")] = OF_CALL
-    mode: Literal["unicast", "multicast"] = OF_CALL
-    command_port: int = OF_CALL
-    body: str = OF_CALL
-    body_id: int | None = OF_CALL
-    bitstream: str = OF_CALL
-    up_axis: Literal["y", "z"] = OF_CALL
+    server_address: Annotated[str, arg(name="server")] = ARGUMENT_DEFAULT
+    local_interface: Annotated[str, arg(name="interface")] = ARGUMENT_DEFAULT
+    mode: Literal["unicast", "multicast"] = ARGUMENT_DEFAULT
+    command_port: int = ARGUMENT_DEFAULT
+    body: str = ARGUMENT_DEFAULT
+    body_id: int | None = ARGUMENT_DEFAULT
+    bitstream: str = ARGUMENT_DEFAULT
+    up_axis: Literal["y", "z"] = ARGUMENT_DEFAULT
 
     seconds: float | None = None
     """Duration [s]; by default until ^C."""

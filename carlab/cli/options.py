@@ -15,8 +15,8 @@ from carlab.api.cars import car_options_text
 from carlab.api.driving import drive
 from carlab.core.errors import ConfigError, DataError
 
-OF_CALL: Any = object()
-"""Default of an option that has the default of an argument, see ``options_of``."""
+ARGUMENT_DEFAULT: Any = object()
+"""Stands for the default of the argument with the name of the option (``options_of``)."""
 T = TypeVar("T")
 
 if TYPE_CHECKING:
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 def options_of(*calls: Callable[..., Any]) -> Callable[[type[T]], type[T]]:
     """Class decorator below ``@dataclass``: options are arguments of functions of the Python API, or of dataclasses.
 
-    An option whose value is ``OF_CALL`` has the default of the argument of its name. An option without a help text has
-    the text of that argument (``carlab.cli.help_texts``). The first call with that argument counts.
+    An option whose value is ``ARGUMENT_DEFAULT`` has the default of the argument of its name. An option without a help
+    text has the text of that argument (``carlab.cli.help_texts``). The first call with that argument counts.
     """
 
     def with_defaults(option_class: type[T]) -> type[T]:
         arguments = {name: p for call in reversed(calls) for name, p in inspect.signature(call).parameters.items()}
-        for name in [name for name, value in vars(option_class).items() if value is OF_CALL]:
+        for name in [name for name, value in vars(option_class).items() if value is ARGUMENT_DEFAULT]:
             setattr(option_class, name, arguments[name].default)
         option_class.calls = calls  # type: ignore[attr-defined]
         return option_class
@@ -45,10 +45,10 @@ def options_of(*calls: Callable[..., Any]) -> Callable[[type[T]], type[T]]:
 class CarOptions:
     """Options that select the car."""
 
-    car: str = OF_CALL
-    vehicle: Path | None = OF_CALL
-    dry_run: bool = OF_CALL
-    reality: Path | None = OF_CALL
+    car: str = ARGUMENT_DEFAULT
+    vehicle: Path | None = ARGUMENT_DEFAULT
+    dry_run: bool = ARGUMENT_DEFAULT
+    reality: Path | None = ARGUMENT_DEFAULT
 
     def to_text(self) -> str:
         """These options as command-line text, each with a leading space; default values are omitted."""
@@ -60,12 +60,12 @@ class CarOptions:
 class TaskOptions:
     """Options that select the task."""
 
-    task: str | None = OF_CALL
+    task: str | None = ARGUMENT_DEFAULT
     """parking, obstacles (parking behind four discs), path (figure eight), laps, or FILE.py:CLASS: a class in your own
     file, derived from carlab.core.task.Task. By default parking, or the task of a run that is resumed or driven again.
     A run folder contains no code, so a run with your own task needs FILE.py:CLASS again."""
 
-    track: Path | None = OF_CALL
+    track: Path | None = ARGUMENT_DEFAULT
 
     def to_text(self) -> str:
         """These options as command-line text, each with a leading space; default values are omitted."""

@@ -15,7 +15,7 @@ from carlab.api.prediction import predict
 from carlab.api.recordings import load
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import OF_CALL, CarOptions, arguments_of, new_file, options_of
+from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, arguments_of, new_file, options_of
 from carlab.cli.recordings import print_errors, print_recording
 from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
@@ -45,11 +45,11 @@ class Replay:
 
     car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    horizon_s: Annotated[float, arg(name="horizon")] = OF_CALL
-    stride_s: Annotated[float, arg(name="stride")] = OF_CALL
-    holdout_share: float = OF_CALL
-    adapt: bool = OF_CALL
-    keep_events: bool = OF_CALL
+    horizon_s: Annotated[float, arg(name="horizon")] = ARGUMENT_DEFAULT
+    stride_s: Annotated[float, arg(name="stride")] = ARGUMENT_DEFAULT
+    holdout_share: float = ARGUMENT_DEFAULT
+    adapt: bool = ARGUMENT_DEFAULT
+    keep_events: bool = ARGUMENT_DEFAULT
 
     save: Path | None = None
     """Write FILE.rrd with the recording and the predictions."""
@@ -57,9 +57,9 @@ class Replay:
     drive: bool = False
     """Drive a simulated car too, instead of predicting."""
 
-    seconds: float | None = OF_CALL
-    seed: int = OF_CALL
-    out: Path = OF_CALL
+    seconds: float | None = ARGUMENT_DEFAULT
+    seed: int = ARGUMENT_DEFAULT
+    out: Path = ARGUMENT_DEFAULT
 
     verbose: bool = False
     """Show the whole log."""

@@ -185,7 +185,7 @@ def estimate(scored: ScoredSearch, name: str) -> Estimate:
 
 
 def standard_error_factor(scored: ScoredSearch) -> float:
-    """Factor on the standard errors of the fit with all effects."""
+    """Factor on the standard errors of the fit; it grows with the error of the model."""
     settings = scored.problem.settings.evidence
     if scored.is_joint:
         return settings.joint_interval_factor

@@ -61,15 +61,15 @@ def array_rollout(
     Returns:
         States (T // every + 1, 6, N): true x, y [m], yaw [rad] (not wrapped), vx, vy [m/s], yaw rate [rad/s].
     """
-    cars, least = start.shape[1], vector_length(start.dtype)
+    cars, min_cars = start.shape[1], vector_length(start.dtype)
     if not cars:
         return np.empty((ticks // every + 1, BODY_ROWS, 0), start.dtype)
-    if cars < least:
-        again = np.arange(least) % cars
-        numbers = {name: v[again] if isinstance(v, np.ndarray) else v for name, v in numbers.items()}
-        past_states = None if past_states is None else past_states[..., again]
-        t0_s = t0_s[again] if isinstance(t0_s, np.ndarray) else t0_s
-        start, commands = (np.ascontiguousarray(array[..., again]) for array in (start, commands))
+    if cars < min_cars:
+        repeated = np.arange(min_cars) % cars
+        numbers = {name: v[repeated] if isinstance(v, np.ndarray) else v for name, v in numbers.items()}
+        past_states = None if past_states is None else past_states[..., repeated]
+        t0_s = t0_s[repeated] if isinstance(t0_s, np.ndarray) else t0_s
+        start, commands = (np.ascontiguousarray(array[..., repeated]) for array in (start, commands))
     rollout = _ArrayRollout(kind, effects, numbers, commands, ticks, t0_s, max_step_s, every)
     carried = rollout.carried_at_start(start, past_states, before)
     ends = np.empty((ticks // every + 2, len(carried), start.shape[1]), start.dtype)
@@ -176,11 +176,11 @@ class _ArrayRollout:
         graph, periods, pieces = trace_step(key), first + np.arange(len(blocks)), self.plan.pieces
         parameters = self._rows(tuple(self.numbers[name] for name in graph.parameters))
         steps = self._rows(tuple(as_array(piece.length_s / piece.steps) for piece in pieces))
-        used: list[FloatRow] = [steps]  # keeps the rows in memory
+        used: list[FloatRow] = [steps]  # the compiled code has their addresses only
         tables = []
         for k, piece in enumerate(pieces):
             where = blocks if k == len(pieces) - 1 else np.full_like(blocks, len(ends) - 1)
-            held = tuple(self._command_rows(channel, piece, periods, used) for channel in range(2))
+            steering, throttle = (self._command_rows(channel, piece, periods, used) for channel in range(2))
             begin_s = as_array(piece.start_s)
             time: Any = address(steps)
             if graph.uses_time:
@@ -194,19 +194,19 @@ class _ArrayRollout:
                 starts = self._addresses(between.reshape(-1, *bodies.shape[1:]), used)
             step = address(steps) + k * steps.strides[0]
             block = address(ends) + ends.strides[0] * where
-            tables.append(segment_table(block, piece.steps, step, time, (held[0], held[1]), starts))
+            tables.append(segment_table(block, piece.steps, step, time, (steering, throttle), starts))
         table = np.stack(tables, axis=1).reshape(-1, tables[0].shape[1])
         advance_rows(key, [*parameters, *carried], table)
 
     def _command_rows(self, channel: int, piece: Piece, periods: IntArray, used: list[FloatRow]) -> IntArray:
         """Addresses (n,) of the commands that act in a piece of n periods; new rows are added to ``used``."""
         rows = self.commands[channel]
-        late, is_new = (as_array(each[channel]) for each in (self.plan.command_periods, piece.new_command))
+        delay_periods, is_new = (as_array(each[channel]) for each in (self.plan.command_periods, piece.new_command))
         newest = periods + (len(rows) - self.ticks)
-        if isinstance(late, np.ndarray):
-            index = np.maximum(newest[:, None] - late - ~is_new, 0)
+        if isinstance(delay_periods, np.ndarray):
+            index = np.maximum(newest[:, None] - delay_periods - ~is_new, 0)
             return self._addresses(np.take_along_axis(rows, index, axis=0), used)
-        return np.asarray(address(rows) + rows.strides[0] * np.maximum(newest - late - (not is_new), 0))
+        return np.asarray(address(rows) + rows.strides[0] * np.maximum(newest - delay_periods - (not is_new), 0))
 
     @staticmethod
     def _addresses(rows: FloatRow, used: list[FloatRow]) -> IntArray:

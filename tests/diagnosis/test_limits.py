@@ -71,9 +71,9 @@ def test_limits_agree_with_fits_of_the_effect(
 
 def test_limits_are_wider_where_the_model_errs(correct: ScoredSearch, limits: dict[str, dict[str, Estimate]]) -> None:
     """By the factors on standard errors; the size at which a slope is taken grows too, so not exactly."""
-    wider = effect_limits(replace(correct, excess=1.0))["steering_lag"]["time_constant"].std
+    std = effect_limits(replace(correct, excess=1.0))["steering_lag"]["time_constant"].std
     factors = DEFAULT.evidence.model_interval_factor / DEFAULT.evidence.interval_factor
-    assert wider == pytest.approx(factors * limits["steering_lag"]["time_constant"].std, rel=0.1)
+    assert std == pytest.approx(factors * limits["steering_lag"]["time_constant"].std, rel=0.1)
     assert factors > 1.2
 
 

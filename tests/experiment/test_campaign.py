@@ -52,15 +52,13 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
     run = RunDirectory.create(tmp_path_factory.mktemp("runs"), "learn")
     record = InterruptedRun(run, tiny_plan(choice), log_sent_actions(choice))
 
-    def run_episodes(on_training: Callable[[str, int, int], None], stop: Callable[[], bool] = lambda: False) -> None:
-        hooks = LearnHooks(on_training=on_training, on_figures=record.figures.append)
+    def run_episodes(stop: Callable[[], bool] = lambda: False, **callbacks: Callable[..., None]) -> None:
+        hooks = LearnHooks(on_figures=record.figures.append, **callbacks)
         campaign = Campaign(choice, record.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False, stop=stop)
         campaign.write_plan()
         for result in campaign.run_episodes():
             record.results.append(result)
             write_report(run, record.plan, record.figures[-1])
-
-    def go_on(stage: str, done: int, total: int) -> None: ...
 
     def kill(stage: str, done: int, total: int) -> None:
         if record.results and stage == "learning to drive":
@@ -70,16 +68,16 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
             os.kill(child.pid or 0, signal.SIGKILL)
 
     with choice.car:
-        run_episodes(go_on, (run.models / "0001").is_dir)
+        run_episodes((run.models / "0001").is_dir)
         record.files_after_stop = names(run)
         record.first_model = (run.models / "0001" / "policy.npz").read_bytes()
         with pytest.raises(DataError) as error:
-            run_episodes(kill)
+            run_episodes(on_training=kill)
         record.error_text = str(error.value)
         record.files_after_kill = names(run)
         (run.models / "0002.partial").mkdir()  # as after a kill of the whole program
         (run.models / "0002.partial" / "policy.npz").write_bytes(b"rubbish")
-        run_episodes(go_on)
+        run_episodes()
     return record
 
 

@@ -31,13 +31,16 @@ def jackknife_covariance(information: FloatArray, scores: FloatArray, precision:
     count = len(information)
     if count == 1:
         return np.asarray(np.linalg.pinv(normal), dtype=np.float64)
-    pairs = zip(information, scores, strict=True)
-    changes = np.array([np.linalg.lstsq(normal - own, score, rcond=None)[0] for own, score in pairs])
+    of_blocks = zip(information, scores, strict=True)
+    changes = np.array([np.linalg.lstsq(normal - matrix, score, rcond=None)[0] for matrix, score in of_blocks])
     return np.asarray((count - 1) / count * changes.T @ changes)
 
 
 def sandwich_design_effects(information: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:
-    """Variance (n,) by the sandwich estimate over that for independent errors; arguments as above."""
+    """Variance (n,) by the sandwich estimate over that for independent errors.
+
+    Arguments as for ``jackknife_covariance``.
+    """
     independent = np.linalg.pinv(information.sum(axis=0) + precision)
     count = len(information)
     changes = scores @ independent

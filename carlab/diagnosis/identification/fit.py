@@ -146,7 +146,7 @@ class Fitter:
     ) -> FloatArray:
         """Whitened errors (P, S, U, 6) at coordinates z (P, n), in batches that bound the memory.
 
-        ``max_step_s`` is the maximum integration step, by default as of ``simulate_windows``.
+        ``max_step_s`` is the maximum integration step [s]; default: that of ``simulate_windows``.
         """
         if len(z) > self.settings.max_batch_sets:
             parts = np.array_split(z, math.ceil(len(z) / self.settings.max_batch_sets))
@@ -287,13 +287,15 @@ class Fitter:
         if not fit.free:
             return replace(fit, covariance=np.zeros((0, 0)), design_effects=np.zeros(0))
         jacobian, white = linearisation or self.linearised(fit)
-        owns = [self.windows.block == block for block in np.unique(self.windows.block)]
-        parts = [self._information(jacobian[:, own], white[own]) for own in owns]
+        masks = [self.windows.block == block for block in np.unique(self.windows.block)]
+        parts = [self._information(jacobian[:, mask], white[mask]) for mask in masks]
+        information = np.array([matrix for matrix, _ in parts])
         scores = np.array([score.sum(axis=1) for _, score in parts])
-        information = np.array([own for own, _ in parts])
-        arguments = information, scores, self.precision(fit.free)
+        precision = self.precision(fit.free)
         return replace(
-            fit, covariance=jackknife_covariance(*arguments), design_effects=sandwich_design_effects(*arguments)
+            fit,
+            covariance=jackknife_covariance(information, scores, precision),
+            design_effects=sandwich_design_effects(information, scores, precision),
         )
 
     def gauss_newton_step(self, fit: Fit, linearisation: Linearisation) -> FloatArray:

@@ -22,7 +22,7 @@ class EvidenceSettings:
     interval_factor: float = 1.25
     """Factor on standard errors by blocks, because errors of neighbouring blocks are dependent too."""
     model_interval_factor: float = 1.75
-    """The same where the error of the model exceeds the noise by far: it depends on the drive and the place
+    """The same where the error of the model is much larger than the noise: it depends on the drive and the place
     (docs/decisions/0037)."""
     min_relative_std: float = 0.01
     """Minimum standard deviation of a number as a share of its value: allows for model error."""
