@@ -55,15 +55,16 @@ def drive(car: Car, policy: Policy, seed: int) -> EpisodeData:
 @pytest.mark.timeout(240)
 def test_same_policy_ends_at_the_same_state(emulated: EmulatedCar, latency: LatencyParts) -> None:
     policy = ReverseParkingPolicy.for_car(default_car().simulator)
-    mean_s = {name: float(samples.mean()) for name, samples in latency.parts.items()}
-    extra_pose_s = mean_s[EXPOSURE_TO_ARRIVAL] - default_car().simulator.mocap.latency_s
+    # The median: one pause of a busy machine delays a third of the samples, and would shift the mean by 0.1 s.
+    typical_s = {name: float(np.median(samples)) for name, samples in latency.parts.items()}
+    extra_pose_s = typical_s[EXPOSURE_TO_ARRIVAL] - default_car().simulator.mocap.latency_s
     distances_m, yaw_differences_rad = [], []
     for seed in SEEDS:
         emulated_episode = drive(emulated, policy, seed)
         simulated = SimulatedCar(
             default_car().simulator,
             seed=seed,
-            extra_command_latency_s=mean_s[COMMAND_TO_WIRE] + mean_s[WIRE_TO_FIRMWARE],
+            extra_command_latency_s=typical_s[COMMAND_TO_WIRE] + typical_s[WIRE_TO_FIRMWARE],
             extra_pose_latency_s=max(extra_pose_s, 0.0),
         )
         with simulated:
