@@ -18,7 +18,7 @@ from drivers.config import ActuatorConfig
 from drivers.sender.logic import Order, Request, SenderState
 from drivers.sender.process import Sender, start_sender
 from drivers.sender.status import SenderStatus
-from drivers.sender.timeout_measurement import MAX_TIMEOUT_S
+from drivers.sender.timeout_measurement import ADVISED_TIMEOUT_S, MAX_TIMEOUT_S
 
 _log = logging.getLogger(__name__)
 
@@ -224,6 +224,13 @@ class Actuator(Resource):
         if not self.is_open or self._sender is None:
             return Health(False, problems)
         status = self._sender.status()
+        warnings = []
+        if ADVISED_TIMEOUT_S < status.motor_timeout_s < math.inf:
+            kind = self.config.device_kind
+            warnings.append(
+                f"the {kind.name} stops the motor only {status.motor_timeout_s:.1f} s after the last command, if the "
+                f"computer or the cable fails; {kind.timeout_hint}"
+            )
         device = self.config.device_kind.name.lower()
         readings = {
             "battery_v": status.input_v,
@@ -247,7 +254,8 @@ class Actuator(Resource):
             "garbage_bytes_count": float(status.garbage_bytes),
             "link_opens_count": float(status.link_opens),
         }
-        return Health(not problems, problems, {name: value for name, value in readings.items() if math.isfinite(value)})
+        finite = {name: value for name, value in readings.items() if math.isfinite(value)}
+        return Health(not problems, problems, finite, tuple(warnings))
 
     def close(self) -> None:
         """Send neutral at least three times, then disconnect; bounded in time, idempotent, safe after any failure."""

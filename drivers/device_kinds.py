@@ -16,10 +16,10 @@ class DeviceKind:
 
     ``factory`` is the import path ``module:function`` of a function from an ActuatorConfig to a Device; only the sender
     process imports it. ``name`` appears in messages and, in lower case, in the names of readings. ``silent_hint`` is
-    the remedy if no device answers, ``timeout_hint`` the remedy if its time-out does not stop the motor,
-    ``garbage_hint`` the remedy if the bytes that arrive are no valid frames. ``command_bytes``, ``request_bytes`` and
-    ``reply_bytes`` are the sizes of the messages of one command, one request of telemetry and one reply: of each
-    message on a serial line, or of the data of each frame on a bus. They are empty if they are unknown.
+    the remedy if no device answers, ``timeout_hint`` the remedy if its time-out does not stop the motor
+    or is long, ``garbage_hint`` the remedy if the bytes that arrive are no valid frames. ``command_bytes``,
+    ``request_bytes`` and ``reply_bytes`` are the sizes of the messages of one command, one request of telemetry and one
+    reply: of each message on a serial line, or of the data of each frame on a bus. They are empty if they are unknown.
     """
 
     factory: str

@@ -163,7 +163,7 @@ class HardwareCar(Car):
         actuator = self.actuator.health()
         problems = (*actuator.problems, *self._pose_reasons())
         readings = {**actuator.readings, **{f"mocap_{k}": v for k, v in self.pose_source.statistics().items()}}
-        return Health(not problems, problems, readings)
+        return Health(not problems, problems, readings, actuator.warnings)
 
     def measure_motor_timeout(self) -> None:
         """Measure the time-out of the motor controller, without motion; ``health`` has the result.

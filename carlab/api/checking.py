@@ -25,7 +25,7 @@ class CarCheck:
     """Result of ``carlab.check``.
 
     Attributes:
-        health: readings by name, which ends in the unit, and problems as sentences.
+        health: readings by name, which ends in the unit, and problems and warnings as sentences.
         latency: samples [s] of each part of the latency; None if no pose arrived.
         problems: why the car is not ready; empty if it is ready.
     """
@@ -45,8 +45,12 @@ class CarCheck:
 
     def _repr_html_(self) -> str:
         parts = [] if self.latency is None else self.latency.rows()
-        return html_table(["reading", "value"], [[*item] for item in self.health.readings.items()]) + html_table(
-            ["latency [ms]", "p50", "p99", "max", "samples"], parts
+        notes = [["problem", text] for text in self.problems] + [["warning", text] for text in self.health.warnings]
+        ready = html_table(["ready", "yes" if self.is_ready else "no"], notes)
+        return (
+            ready
+            + html_table(["reading", "value"], [[*item] for item in self.health.readings.items()])
+            + html_table(["latency [ms]", "p50", "p99", "max", "samples"], parts)
         )
 
 

@@ -8,7 +8,7 @@ from rich.text import Text
 from tyro.conf import OmitArgPrefixes
 
 from carlab.api.checking import check
-from carlab.cli.console import banner, console, fail, readings_table, table
+from carlab.cli.console import banner, console, fail, readings_table, table, warn
 from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.core.errors import NotReadyError
 from carlab.experiment.episodes.hooks import RunHooks
@@ -50,6 +50,8 @@ class Check:
                 for name, p50, p99, top, count in result.latency.rows()
             ]
             table("Latency [ms]", ["part", "p50", "p99", "max", "samples"], lines)
+        for warning in result.health.warnings:
+            warn(warning)
         for problem in result.problems:
             fail(problem)
         console.print(Text("Ready.", "green") if result.is_ready else Text("Not ready.", "red"))

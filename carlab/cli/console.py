@@ -66,6 +66,11 @@ def fail(message: str) -> None:
     error_console.print(Text("carlab:", "bold red"), Text(message), soft_wrap=True)
 
 
+def warn(message: str) -> None:
+    """Print a warning."""
+    error_console.print(Text("Warning:", "bold yellow"), Text(message), soft_wrap=True)
+
+
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:
     """Print a table; with ``numeric``, the columns after the first are right-aligned.
 

@@ -122,11 +122,16 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """A snapshot of a car's condition. ``readings`` are numbers whose names end in their units (``battery_v``)."""
+    """A snapshot of a car's condition.
+
+    ``readings`` are numbers whose names end in their units (``battery_v``). ``problems`` prevent arming, ``warnings``
+    do not; each is a sentence with its remedy.
+    """
 
     ready: bool
     problems: tuple[str, ...] = ()
     readings: Mapping[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,4 +38,5 @@ def test_fault_during_the_check_is_a_problem_among_the_readings(tmp_path: Path) 
         thread.join()
     assert not found.is_ready
     assert any("was lost" in problem for problem in found.problems)
+    assert "<td>problem</td>" in found._repr_html_()
     assert found.health.readings["mocap_frames"] > 0

@@ -43,9 +43,20 @@ def test_timeout_is_measured_in_neutral_and_the_car_can_be_armed_afterwards() ->
         assert all(entry.value == 0.0 for entry in firmware.log.motor())
         assert actuator.health().readings["vesc_motor_timeout_flag"] == 0.0
         assert actuator.problems() == ()
+        assert actuator.health().warnings == ()
         actuator.arm()
         actuator.command(MOVING)
         until(lambda: firmware.log.motor()[-1].value == 3.0)
+
+
+def test_long_timeout_is_a_warning_with_the_remedy_and_the_car_can_be_armed() -> None:
+    with served(1.0) as firmware, connected(firmware) as actuator:
+        assert actuator.health().warnings == ()  # not yet measured
+        actuator.measure_motor_timeout()
+        (warning,) = actuator.health().warnings
+        assert warning.startswith("the VESC stops the motor only 1.")
+        assert warning.endswith("set Timeout in VESC Tool (App Settings, General) to 200 to 300 ms.")
+        actuator.arm()
 
 
 def test_missing_timeout_is_a_problem_with_the_remedy() -> None:

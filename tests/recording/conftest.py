@@ -53,7 +53,9 @@ def _documents(ticks: int, *, end: bool = True):
     for k in range(ticks):
         t_s = START_S + k * PERIOD_S
         if k % 30 == 0:
-            yield HealthReading(t_s, Health(k == 0, ("battery low",) if k else (), {"battery_v": 7.4 - 0.1 * k}))
+            yield HealthReading(
+                t_s, Health(k == 0, ("battery low",) if k else (), {"battery_v": 7.4 - 0.1 * k}, ("battery soon low",))
+            )
         if k == 5:
             yield SafetyEvent(t_s, "clip", "steering +1.3 was clipped to +1.0")
         following = rng.normal(size=13)

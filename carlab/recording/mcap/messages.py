@@ -79,6 +79,7 @@ def encode(item: Item, unix: UnixMapping, now_s: float) -> Iterator[Stamped]:
                 problems=[text(problem) for problem in item.health.problems],
                 reading_names=list(item.health.readings),
                 reading_values=list(item.health.readings.values()),
+                warnings=[text(warning) for warning in item.health.warnings],
             )
             yield Stamped(schemas.HEALTH_TOPIC, health, item.t_s, item.t_s)
         case EpisodeEnded():
@@ -315,7 +316,7 @@ def decode_transition(m: Any) -> Transition:
 def decode_health(m: Any) -> HealthReading:
     """Decode a Health message."""
     readings = dict(zip(m.reading_names, m.reading_values, strict=False))
-    return HealthReading(m.t_s, Health(m.ready, tuple(m.problems), readings))
+    return HealthReading(m.t_s, Health(m.ready, tuple(m.problems), readings, tuple(m.warnings)))
 
 
 def decode_event(m: Any) -> SafetyEvent:

@@ -88,6 +88,7 @@ MESSAGES: dict[str, tuple[Field, ...]] = {
         Field("problems", "string", 3, repeated=True),
         Field("reading_names", "string", 4, repeated=True),
         Field("reading_values", "double", 5, "at the end of each reading's name", repeated=True),
+        Field("warnings", "string", 6, repeated=True),
     ),
     "Extra": (
         *_STAMP,
