@@ -73,7 +73,6 @@ def _jobs(
     """One job for each number of rows and seed, with all priors."""
     from carlab.studies.priors import checked_counts
 
-    assert case.rows is not None
     recorded, contents = recorded_files(files, car, case.rows.history)
     contents[MODEL] = model.read_bytes()
     jobs = []

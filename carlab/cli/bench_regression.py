@@ -61,7 +61,6 @@ def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Scor
     given = ["--case", options.case, *(["--structure"] if options.structure else [])]
     files: dict[str, bytes] = {}
     if not isinstance(case, str):
-        assert case.rows is not None
         recorded, files = recorded_files(_recordings(options), options.car, case.rows.history)
         given += recorded
     elif options.data is not None:

@@ -75,7 +75,6 @@ def _jobs(
     """One job for each number of rows and seed; ``failures`` receives the messages of failed ones."""
     from carlab.studies.rollouts import checked_counts, scores_from_json
 
-    assert case.rows is not None
     more, contents = recorded_files(files, options.car, case.rows.history)
     more += ["--curves"] if options.curves else []
 

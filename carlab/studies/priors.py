@@ -64,7 +64,6 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     Raises:
         ConfigError: the diagnosed car has another control period than the rows.
     """
-    assert case.rows is not None
     period_s = car.control_period_s
     check_period(diagnosed, period_s, "the car's file")
     velocity_delay = velocity_delay_s(case.rows, period_s)
@@ -90,7 +89,6 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
 
 def checked_counts(case: RecordedCase, rows: Sequence[int]) -> tuple[int, ...]:
     """Numbers of rows, by default those of the case. Raises DataError if the recordings have fewer rows."""
-    assert case.rows is not None
     counts = tuple(rows) or case.counts
     if max(counts) > len(case.rows):
         raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; give fewer with --rows.")
@@ -125,7 +123,6 @@ def run_prior_study(
     Raises:
         DataError: the recordings have too few rows.
     """
-    assert case.rows is not None
     counts = checked_counts(case, rows)
     domain = priors.get(NOMINAL) or case.prior
     plan = list(itertools.product(counts, range(first_seed, first_seed + seeds), priors))

@@ -119,8 +119,6 @@ def run_rollout_study(
         ConfigError: curves with a number of rows: they are fitted to windows, which need whole recordings.
         DataError: too few rows, or a recording without a window in which the car moves.
     """
-    assert case.rows is not None
-    assert case.held_out is not None
     counts = checked_counts(case, recordings, rows, with_curves=curves_from is not None)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
     fit_windows, held_out = (recorded_windows(of, max(HORIZONS_S), STRIDE_S) for of in (fitted, recordings[-1]))
@@ -151,7 +149,6 @@ def _fit_without_fold(
 
     Curves of a fold are fitted once, for all seeds.
     """
-    assert case.rows is not None
     fold_of_row = folds_of_rows(case.rows, episodes)
     dense_windows = recorded_windows(episodes, max(HORIZONS_S), FIT_STRIDE_S)
 
@@ -172,8 +169,6 @@ def _scores(
     case: RecordedCase, car: CarDynamics, disturbed: DisturbedCar, windows: PredictionWindows, count: Rows, seed: int
 ) -> Iterator[RolloutScore]:
     """Scores of both kinds of rollouts on held-out windows."""
-    assert case.rows is not None
-    assert case.held_out is not None
     n_rows = len(case.rows) if count == ALL_ROWS else count
     nll = _one_step_nll(car, case.held_out)
     models: tuple[tuple[str, RolloutModel], ...] = ((INDEPENDENT, car), (DISTURBED, disturbed))
@@ -185,7 +180,6 @@ def _without_fold(
     case: RecordedCase, windows: PredictionWindows, fold_of_row: np.ndarray, fold: int | None
 ) -> tuple[Transitions, PredictionWindows]:
     """Rows and windows without those of a fold; all of them for None."""
-    assert case.rows is not None
     if fold is None:
         return case.rows, windows
     return case.rows.take(fold_of_row != fold), windows.take((_folds_of(windows) != fold).all(axis=0))
@@ -218,7 +212,6 @@ def checked_counts(
     counts = tuple(rows) or ((ALL_ROWS,) if with_curves else COUNTS)
     if with_curves and any(count != ALL_ROWS for count in counts):
         raise ConfigError("Measured curves are fitted to whole recordings, not to random rows; use --rows all.")
-    assert case.rows is not None
     fold_of_row = folds_of_rows(case.rows, [episode for recording in recordings[:-1] for episode in recording])
     smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
     largest = max((count for count in counts if count != ALL_ROWS), default=0)

@@ -10,7 +10,7 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.studies.regression.cases import CASES, BodyFrame, in_body_frame
+from carlab.studies.regression.cases import CASES, BodyFrameCar, in_body_frame
 from carlab.studies.regression.recordings import recorded_case
 from carlab.studies.regression.study import run_study
 from learning.priors.domain_models import KinematicCar, draw_parameters
@@ -51,7 +51,7 @@ def test_kinematic_car_in_the_body_frame_equals_the_one_at_the_origin() -> None:
     changes = model(rows, parameters)
     for k in range(5):
         inputs, outputs = in_body_frame(rows, rows[:, :7] + changes[k])
-        assert torch.allclose(BodyFrame(model)(inputs, parameters)[k], outputs, atol=1e-6)
+        assert torch.allclose(BodyFrameCar()(inputs, parameters)[k], outputs, atol=1e-6)
 
 
 def test_output_norms_are_equal_in_the_world_and_body_frames(shared: Path) -> None:

@@ -210,31 +210,13 @@ def in_body_frame(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @dataclass(frozen=True, slots=True)
-class BodyFrame:
-    """A domain model of the car with inputs in the body frame."""
-
-    model: KinematicCar
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return self.model.size
+class BodyFrameCar(KinematicCar):
+    """The kinematic car with inputs in the body frame: it heads along x, so that world and body frame agree."""
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Inputs of the model (count, 9), transformed to the body frame."""
-        drawn = self.model.inputs(count, generator)
+        """Inputs of the kinematic car (count, 9), transformed to the body frame."""
+        drawn = KinematicCar.inputs(self, count, generator)
         return in_body_frame(drawn, drawn[:, :7])[0]
-
-    def parameters(self, normal: Tensor) -> Tensor:
-        """Parameters (P, 7) for standard normal draws (P, 7), by the model."""
-        return self.model.parameters(normal)
-
-    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes of the state (P, N, 7) at inputs (N, 9) for parameters (P, 7).
-
-        The car heads along x, so that world and body frame agree.
-        """
-        return self.model(inputs, parameters)
 
 
 _CAR_NOISE = (0.0011, 0.0011, 0.0018, 0.0018, 0.0082, 0.0082, 0.0368)
@@ -277,7 +259,7 @@ _RACECAR_WORLD_FRAME = Case(
 )
 _RACECAR_BODY_FRAME = replace(
     _RACECAR_WORLD_FRAME,
-    prior=BodyFrame(KinematicCar()),
+    prior=BodyFrameCar(),
     input_std=(3.0, 3.0, 1.0, 1.0, 1.5, 1.5, 2.0, 0.6, 0.6),
     output_std=(0.1, 0.06, 0.1, 0.03, 1.0, 1.0, 3.0),
     function_lengthscale=2.0,

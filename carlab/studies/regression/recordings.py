@@ -32,7 +32,7 @@ SMALL_DISCREPANCY, MIN_ROWS_FOR_DEFAULT = (0.03,) * 3 + (0.1,) * 3, 400
 """Prior discrepancy of steps and of velocities with fewer rows (docs/decisions/0012); more rows have the default."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedCase(Case):
     """Rows of recordings.
 
@@ -43,10 +43,10 @@ class RecordedCase(Case):
         history_message: how the history was chosen.
     """
 
-    rows: Transitions | None = None
-    held_out: Transitions | None = None
-    held_out_yaw: np.ndarray | None = None
-    history_message: str = ""
+    rows: Transitions
+    held_out: Transitions
+    held_out_yaw: np.ndarray
+    history_message: str
 
     def prior_discrepancy_for(self, count: int) -> float | tuple[float, ...] | None:
         """Prior size of the discrepancy with so many rows, in units of the outputs."""
@@ -54,9 +54,6 @@ class RecordedCase(Case):
 
     def recorded(self, folder: Path, count: int, seed: int) -> Data:
         """Rows drawn from all but the last recording, and the last one whole. Raises DataError for too few."""
-        assert self.rows is not None
-        assert self.held_out is not None
-        assert self.held_out_yaw is not None
         if count > len(self.rows):
             raise DataError(f"The recordings have {len(self.rows)} rows, not {count}; give fewer with --rows.")
         chosen = self.rows.take(np.random.default_rng(seed).choice(len(self.rows), count, replace=False))
