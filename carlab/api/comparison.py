@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ from carlab.api.loaded_recordings import RecordingLike, as_list, check_contents,
 from carlab.api.loaded_recordings import load_recordings as read
 from carlab.core.errors import ConfigError
 from carlab.core.tables import nearest_name
-from carlab.recording.atomic_files import write_text
+from carlab.recording.atomic_files import write_json
 from carlab.recording.sink import make_folder, writing
 
 if TYPE_CHECKING:
@@ -83,4 +82,4 @@ def compare(
 def _save(found: Comparison, folder: Path) -> None:
     with writing(folder):
         make_folder(folder)
-    write_text(folder / FILE_NAME, json.dumps(found.to_dict(), indent=2) + "\n")
+    write_json(folder / FILE_NAME, found.to_dict())

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from carlab.api.arguments import above_zero, at_least, at_most
 from carlab.cli.bench_options import BenchOptions, check_options, row_counts
-from carlab.cli.bench_output import write_figures
 from carlab.cli.console import console, table
 from carlab.cli.options import json_file
 from carlab.core.seeds import MAX_SEED
+from carlab.recording.atomic_files import write_json
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Bench(BenchOptions):
         rows = [[part, name, f"{value:.4g}"] for part, values in figures.items() for name, value in _flat(values)]
         table("Speed", ["part", "figure", "value"], rows)
         if self.out is not None:
-            write_figures(self.out, figures)
+            write_json(self.out, figures)
             console.print(str(self.out))
         return 0
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from carlab.cli.bench_jobs import StudyJob, read_figures, run_jobs
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.jobs.child_jobs import ChildJob
-from carlab.recording.atomic_files import write_text
+from carlab.recording.atomic_files import write_json
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
@@ -27,11 +26,6 @@ SPEED_PERIOD_S = 600.0
 def command() -> str:
     """The current command line."""
     return " ".join(["carlab", *sys.argv[1:]])
-
-
-def write_figures(path: Path, figures: Mapping[str, Any]) -> None:
-    """Write a JSON file atomically. Raises DataError on failure; an existing file then remains."""
-    write_text(path, json.dumps(figures, indent=2) + "\n")
 
 
 def run_and_write(
@@ -82,7 +76,7 @@ def _write_scores(new: Sequence[Score], scores: Sequence[Score], options: BenchO
 
     if options.out is not None:
         device = f"{options.device} of Ray {options.ray}" if options.ray else device_name(options.device)
-        write_figures(options.out, as_json(scores, command(), device))
+        write_json(options.out, as_json(scores, command(), device))
     for score in new:
         if score.failed is not None:
             fail(f"{score.method}, {score.rows} rows, seed {score.seed} failed: {score.failed}")

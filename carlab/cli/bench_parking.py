@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from carlab.cli.bench_jobs import StudyJob, run_jobs, uses_jobs
-from carlab.cli.bench_output import command, write_figures
+from carlab.cli.bench_output import command
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.core.errors import ConfigError
 from carlab.core.json_files import plain
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd, read_files, write_files
 from carlab.jobs.child_processes import ONE_THREAD
+from carlab.recording.atomic_files import write_json
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
@@ -217,7 +218,7 @@ def _report(curves: list[Curve], options: BenchOptions) -> None:
         table("Cars that differ from the prior", columns, [_arm_row(row) for row in arms])
     if options.out is not None:
         content = as_json(curves, command())
-        write_figures(options.out, content | ({"arms": [plain(asdict(row)) for row in arms]} if arms else {}))
+        write_json(options.out, content | ({"arms": [plain(asdict(row)) for row in arms]} if arms else {}))
         picture: Path = options.out.with_suffix(".png")
         draw(curves, picture)
         console.print(f"{options.out}, {picture}, {options.runs}")

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_output import command, write_figures
+from carlab.cli.bench_output import command
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.runs import search_callbacks
 from carlab.core.errors import ConfigError
+from carlab.recording.atomic_files import write_json
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
@@ -54,6 +55,6 @@ def run_realcars(options: BenchOptions) -> int:
     for sentence in diagnosed_event_sentences(report.diagnosis):
         console.print(sentence)
     if options.out is not None:
-        write_figures(options.out, as_json(errors, command(), {"fit": fit, "held_out": held_out}))
+        write_json(options.out, as_json(errors, command(), {"fit": fit, "held_out": held_out}))
         console.print(f"{options.out}; the report of the diagnosis is in {options.out.with_suffix('')}.")
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.cli.bench_jobs import StudyJob, bench_job, read_figures, recorded_files, run_jobs, uses_jobs
-from carlab.cli.bench_output import command, write_figures
+from carlab.cli.bench_output import command
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
@@ -16,6 +16,7 @@ from carlab.cli.recordings import load_episodes
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.experiment.episodes.interrupts import Interrupts
+from carlab.recording.atomic_files import write_json
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
@@ -102,7 +103,7 @@ def _write(scores: Sequence[RolloutScore], options: BenchOptions) -> None:
     from carlab.studies.rollouts import as_json
 
     if options.out is not None:
-        write_figures(options.out, as_json(scores, command()))
+        write_json(options.out, as_json(scores, command()))
 
 
 def _print(scores: Sequence[RolloutScore], held_out: str) -> None:

@@ -14,7 +14,7 @@ from carlab.cli.console import console
 from carlab.cli.options import new_file, options_of
 from carlab.cli.recordings import print_findings
 from carlab.core.errors import ConfigError, DataError
-from carlab.recording.atomic_files import write_text
+from carlab.recording.atomic_files import write_json
 from carlab.recording.column_mapping import ColumnMapping
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ class Import:
     def _write_report(self, report: AuditReport) -> None:
         if self.report is not None:
             self.report.parent.mkdir(parents=True, exist_ok=True)
-            write_text(self.report, json.dumps(report.to_dict(), indent=2) + "\n")
+            write_json(self.report, report.to_dict())
 
     def _mapping(self) -> ColumnMapping | None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}

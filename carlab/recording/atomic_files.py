@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from carlab.core.errors import DataError
 from carlab.recording.sink import describe_os_error, partial_path
@@ -47,6 +48,11 @@ def write_text(path: Path, text: str) -> None:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
+
+
+def write_json(path: Path, content: Mapping[str, Any], default: Callable[[Any], Any] | None = None) -> None:
+    """Write a JSON object as ``write_text`` does; ``default`` converts values that JSON does not have."""
+    write_text(path, json.dumps(content, indent=2, default=default) + "\n")
 
 
 @contextmanager

@@ -33,7 +33,8 @@ from typing import Any, Self
 from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.version import VERSION
-from carlab.recording.sink import describe_os_error, writing
+from carlab.recording.atomic_files import write_json
+from carlab.recording.sink import writing
 
 _PACKAGES = (
     *("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "rerun-sdk", "mcap", "protobuf", "pyarrow"),
@@ -177,14 +178,7 @@ class RunDirectory:
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file atomically. Raises DataError if that fails."""
-        path = self.path / name
-        unfinished = path.with_name(f"{name}.partial")
-        try:
-            unfinished.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
-            os.replace(unfinished, path)
-        except OSError as error:
-            unfinished.unlink(missing_ok=True)
-            raise DataError(describe_os_error(error, path)) from error
+        write_json(self.path / name, content, default=str)
 
 
 def _create_folder(path: Path) -> bool:

@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from carlab.cli import run
-from carlab.cli.bench_output import write_figures
 from carlab.core.errors import DataError
+from carlab.recording.atomic_files import write_json
 from carlab.studies.regression.methods import METHODS
 from carlab.studies.regression.scores import FIGURES, Score, as_json, summarised
 from carlab.studies.regression.study import run_study
@@ -159,7 +159,7 @@ def test_file_holds_all_earlier_scores_during_a_fit(
 
 def test_file_is_unchanged_if_it_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "study.json"
-    write_figures(out, {"scores": [1]})
+    write_json(out, {"scores": [1]})
     assert read_strict_json(out) == {"scores": [1]}
 
     def fail_with_full_disk(descriptor: int) -> None:
@@ -167,7 +167,7 @@ def test_file_is_unchanged_if_it_cannot_be_written(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr("os.fsync", fail_with_full_disk)
     with pytest.raises(DataError, match=r"study\.json could not be written because the disk is full"):
-        write_figures(out, {"scores": [1, 2]})
+        write_json(out, {"scores": [1, 2]})
     assert read_strict_json(out) == {"scores": [1]}
     assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
 

@@ -6,7 +6,6 @@ unchanged; the run continues.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from carlab.experiment.campaign.prior_correction import (
     without_ranges,
 )
 from carlab.experiment.campaign.quick_check import CHECK_FILE, MIN_DIAGNOSIS_EPISODES
-from carlab.recording.atomic_files import write_text
+from carlab.recording.atomic_files import write_json
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -94,7 +93,7 @@ def run_correction_subprocess(
         version = _failed(request, f"its process died ({error})" if error.end == "died" else str(error))
     if version is None:
         return None
-    write_text(request.folder / CORRECTION_FILE, json.dumps(version.to_dict(), indent=2) + "\n")
+    write_json(request.folder / CORRECTION_FILE, version.to_dict())
     return version
 
 

@@ -6,16 +6,16 @@ part of the result; the run continues.
 
 from __future__ import annotations
 
-import json
 import logging
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from carlab.core.errors import DataError
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.child_process import ChildError, run_in_child
+from carlab.recording.atomic_files import write_json
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -117,10 +117,8 @@ def _failed(reason: str) -> dict[str, Any]:
 def _saved(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
     """Write the content of the file; returns it."""
     content = {"episode": episode, **result}
-    unfinished = path.with_name(f"{path.name}.partial")
     try:
-        unfinished.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        os.replace(unfinished, path)
-    except OSError as error:
-        log.warning("%s cannot be written: %s", path, error)
+        write_json(path, content)
+    except DataError as error:
+        log.warning("The quick check is not stored: %s", error)
     return content
