@@ -64,7 +64,7 @@ def busy_thread(is_busy: bool) -> Iterator[None]:
             thread.join()
 
 
-def _drive(port: str, rate_hz: float, seconds: float, *, is_busy: bool, realtime_priority: bool) -> SenderStatus:
+def _drive(port: str, rate_hz: float, seconds: float, *, is_busy: bool) -> SenderStatus:
     """Drive at 30 Hz for some seconds and return the sender's status with its lateness."""
     config = ActuatorConfig(
         port=port,
@@ -72,7 +72,7 @@ def _drive(port: str, rate_hz: float, seconds: float, *, is_busy: bool, realtime
         telemetry_rate_hz=min(50.0, rate_hz),
         watchdog_s=1.0,
         latch_s=5.0,
-        realtime_priority=realtime_priority,
+        realtime_priority=True,
     )
     with Actuator(config, ActuatorCalibration()) as actuator, busy_thread(is_busy):
         actuator.arm()
@@ -83,9 +83,7 @@ def _drive(port: str, rate_hz: float, seconds: float, *, is_busy: bool, realtime
         return actuator.status()
 
 
-def sender_lateness(
-    seconds: float = 5.0, rates_hz: Sequence[float] = (30.0, 100.0), *, realtime_priority: bool = True
-) -> dict[str, float]:
+def sender_lateness(seconds: float = 5.0, rates_hz: Sequence[float] = (30.0, 100.0)) -> dict[str, float]:
     """Measure the lateness of the sender's deadlines with an emulated firmware in another process.
 
     For every rate R and condition C (``idle``, and ``loaded`` with a CPU-bound Python thread in this process):
@@ -96,9 +94,7 @@ def sender_lateness(
     with firmware_process() as port:
         for rate_hz in rates_hz:
             for condition in ("idle", "loaded"):
-                status = _drive(
-                    port, rate_hz, seconds, is_busy=condition == "loaded", realtime_priority=realtime_priority
-                )
+                status = _drive(port, rate_hz, seconds, is_busy=condition == "loaded")
                 stem = f"sender_{rate_hz:g}_hz_{condition}_late"
                 figures[f"{stem}_p50_ms"] = status.late_p50_ms
                 figures[f"{stem}_p99_ms"] = status.late_p99_ms

@@ -97,8 +97,8 @@ class NetworkEnsemble:
                 f"{1 / windows.period_s:.1f} Hz; train it on recordings with the same rate."
             )
         with torch.no_grad():
-            paths = _paths(self, _inputs(windows, self, self.input_mean.device, _simulated(self.simulator, windows)))
-        mean = paths.mean(dim=0).double().cpu().numpy()
+            paths = _paths(self, _inputs(windows, self, _simulated(self.simulator, windows)))
+        mean = paths.mean(dim=0).double().numpy()
         return _in_world(mean, windows)
 
 
@@ -127,7 +127,6 @@ def train_ensemble(
     *,
     simulator: PredictiveModel | None = None,
     seed: int = 0,
-    device: str = "cpu",
     velocity_window_s2: float = 0.0,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
@@ -139,7 +138,6 @@ def train_ensemble(
         settings: sizes and training.
         simulator: model whose discrepancy the networks learn; without it they are a black box.
         seed: seed of initial weights, batches and validation blocks.
-        device: torch device.
         velocity_window_s2: variance [s2] of the velocity window, for the initial states.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the best networks so far are returned.
@@ -151,7 +149,7 @@ def train_ensemble(
     check_duration(segments, settings)
     windows = cut_windows(segments, settings.horizon_s, settings.stride_s)
     windows = replace(windows, velocity_window_s2=velocity_window_s2)
-    return _Training(windows, settings, simulator, seed, torch.device(device)).run(progress, stop)
+    return _Training(windows, settings, simulator, seed).run(progress, stop)
 
 
 @dataclass(slots=True)
@@ -162,7 +160,6 @@ class _Training:
     settings: EnsembleSettings
     simulator: PredictiveModel | None
     seed: int
-    device: torch.device
     _best: tuple[float, Weights] = field(init=False, default=(math.inf, ()))
 
     def run(self, progress: Progress, stop: Callable[[], bool]) -> NetworkEnsemble:
@@ -171,11 +168,11 @@ class _Training:
         simulated = _simulated(self.simulator, windows)
         model = self._initial(generator, simulated)
         validates = _validation(windows, settings.validation_share, self.seed)
-        target = _target(windows, self.device)
-        scale = _scale(windows.take(~validates), self.device)
-        inputs = _inputs(windows, model, self.device, simulated)
+        target = _target(windows)
+        scale = _scale(windows.take(~validates))
+        inputs = _inputs(windows, model, simulated)
         rows = torch.from_numpy(np.flatnonzero(~validates))
-        held_rows = torch.from_numpy(np.flatnonzero(validates)).to(self.device)
+        held_rows = torch.from_numpy(np.flatnonzero(validates))
         optimiser = torch.optim.AdamW(model.weights, settings.learning_rate, weight_decay=settings.weight_decay)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.updates)
         for update in range(settings.updates):
@@ -184,7 +181,7 @@ class _Training:
             if update % settings.check_every == 0:
                 self._check(model, inputs, target, scale, held_rows)
                 progress(f"training {self._name}", update / settings.updates)
-            batch = rows[torch.randint(len(rows), (settings.batch_windows,), generator=generator)].to(self.device)
+            batch = rows[torch.randint(len(rows), (settings.batch_windows,), generator=generator)]
             steps = _curriculum(update / settings.updates, windows.steps)
             loss = self._loss(model, inputs, target, scale, batch, steps).mean()
             optimiser.zero_grad()
@@ -209,7 +206,7 @@ class _Training:
             gain = 0.1 if layer == 2 else 1.0
             drawn = torch.randn(settings.n_networks, before, after, generator=generator) * gain / math.sqrt(before)
             zeros = torch.zeros(settings.n_networks, 1, after)
-            weights += [drawn.to(self.device).requires_grad_(), zeros.to(self.device).requires_grad_()]
+            weights += [drawn.requires_grad_(), zeros.requires_grad_()]
         velocities = windows.measured[..., 3:].reshape(-1, 3)
         commands = windows.commands.reshape(-1, 2)
         repeats = ((velocities, settings.velocity_rows), (commands, past + 1))
@@ -221,7 +218,7 @@ class _Training:
             input_mean = np.concatenate([input_mean, np.zeros(6)])
             input_std = np.concatenate([input_std, error_std, rate_std])
         unit = np.maximum(STD_OVER_MAD * np.median(np.abs(rate), axis=(0, 1)), 1e-2)
-        mean, std, output = (torch.from_numpy(v).float().to(self.device) for v in (input_mean, input_std, unit))
+        mean, std, output = (torch.from_numpy(v).float() for v in (input_mean, input_std, unit))
         rows = settings.velocity_rows
         return NetworkEnsemble(tuple(weights), windows.period_s, past, rows, mean, std, output, self.simulator)
 
@@ -305,33 +302,31 @@ def _simulated_std(windows: PredictionWindows, simulated: FloatArray) -> tuple[F
     return np.maximum(error.std(axis=(0, 1)), 1e-3), np.maximum(rate.std(axis=(0, 1)), 1e-2)
 
 
-def _inputs(
-    windows: PredictionWindows, model: NetworkEnsemble, device: torch.device, simulated: FloatArray | None
-) -> _Inputs:
+def _inputs(windows: PredictionWindows, model: NetworkEnsemble, simulated: FloatArray | None) -> _Inputs:
     past = windows.past_commands[:, windows.past_commands.shape[1] - model.past_rows :]
     commands = np.concatenate([past, windows.commands], axis=1)
     before = windows.past_states[:, windows.past_states.shape[1] - model.velocity_rows + 1 :, 3:]
     velocities = np.concatenate([before, windows.initial_states[:, None, 3:]], axis=1)
 
     def tensor(array: FloatArray) -> torch.Tensor:
-        return torch.from_numpy(array).float().to(device)
+        return torch.from_numpy(array).float()
 
     return _Inputs(tensor(commands), tensor(velocities), None if simulated is None else tensor(simulated))
 
 
-def _target(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
+def _target(windows: PredictionWindows) -> torch.Tensor:
     """Measured path (S, K + 1, 6) with the pose in the frame of the initial pose."""
     zero = np.zeros_like(windows.measured)
     zero[..., :3] = windows.initial_states[:, None, :3]
     path = -prediction_errors(zero, windows)
-    return torch.from_numpy(path).float().to(device)
+    return torch.from_numpy(path).float()
 
 
-def _scale(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
+def _scale(windows: PredictionWindows) -> torch.Tensor:
     """Median error (K + 1, 6) of the constant-velocity baseline, at least a tenth of that of its last step."""
     error = np.abs(prediction_errors(ConstantVelocity().predict(windows), windows))
     spread = STD_OVER_MAD * np.median(error, axis=0)
-    return torch.from_numpy(np.maximum(spread, np.maximum(0.1 * spread[-1], 1e-4))).float().to(device)
+    return torch.from_numpy(np.maximum(spread, np.maximum(0.1 * spread[-1], 1e-4))).float()
 
 
 def _validation(windows: PredictionWindows, share: float, seed: int) -> np.ndarray:

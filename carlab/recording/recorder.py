@@ -84,9 +84,9 @@ class Recorder(Resource):
             return
         self._queue.put(document)
 
-    def log_handler(self, level: int = logging.INFO) -> logging.Handler:
+    def log_handler(self) -> logging.Handler:
         """A logging handler that writes the program's log into the recording; the caller adds and removes it."""
-        return _RecorderHandler(self, level)
+        return _RecorderHandler(self)
 
     def close(self, timeout_s: float = 5.0) -> None:
         """Write the queued documents, complete the files and join the writer. Idempotent, from any thread.
@@ -190,8 +190,8 @@ class Recorder(Resource):
 class _RecorderHandler(logging.Handler):
     """Sends log records to a recorder, except its own records (to avoid an endless loop)."""
 
-    def __init__(self, recorder: Recorder, level: int) -> None:
-        super().__init__(level)
+    def __init__(self, recorder: Recorder) -> None:
+        super().__init__(logging.INFO)
         self._recorder = recorder
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -160,7 +160,7 @@ class RunDirectory:
         ends = (".mcap", ".mcap.partial") if partial else (".mcap",)
         return sorted(entry for entry in self.episodes.iterdir() if entry.name.endswith(ends))
 
-    def log_handler(self, level: int = logging.INFO) -> logging.Handler:
+    def log_handler(self) -> logging.Handler:
         """A logging handler that appends to log.jsonl; the caller adds, removes and closes it.
 
         Raises:
@@ -168,7 +168,7 @@ class RunDirectory:
         """
         with writing(self.path / "log.jsonl"):
             handler = _LogFile(self.path / "log.jsonl", encoding="utf-8", errors="backslashreplace")
-        handler.setLevel(level)
+        handler.setLevel(logging.INFO)
         handler.setFormatter(JsonFormatter())
         return handler
 

@@ -56,7 +56,6 @@ class VescFirmware:
         on_servo: Called with time [s] and position in [0, 1].
         readings: Measurements of the motor controller at a time [s]; by default those of a car at rest.
         motor_timeout_s: Time without a motor command after which the motor is released [s].
-        version: Version that it reports.
         controller_id: Controller id on CAN.
     """
 
@@ -68,7 +67,6 @@ class VescFirmware:
         on_servo: ServoCallback | None = None,
         readings: Callable[[float], MotorValues] | None = None,
         motor_timeout_s: float = 1.0,
-        version: FirmwareVersion = EMULATED_VERSION,
         controller_id: int = 23,
     ) -> None:
         self.log = log
@@ -76,7 +74,7 @@ class VescFirmware:
         self.on_servo = on_servo
         self.readings = readings
         self.motor_timeout_s = motor_timeout_s
-        self.version = version
+        self.version = EMULATED_VERSION
         self.controller_id = controller_id
         self.kill_switch = False
         self.fault_code = 0

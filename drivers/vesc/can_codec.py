@@ -120,9 +120,9 @@ def set_servo_position(controller_id: int, host_id: int, position: float) -> Can
     return frame
 
 
-def pong(host_id: int, controller_id: int, hardware_type: int = 0) -> CanFrame:
-    """A controller's answer to PING; hardware type 0 is a motor controller."""
-    return CanFrame(_identifier(Packet.PONG, host_id), bytes((controller_id, hardware_type)))
+def pong(host_id: int, controller_id: int) -> CanFrame:
+    """A motor controller's answer to PING: its id and hardware type 0."""
+    return CanFrame(_identifier(Packet.PONG, host_id), bytes((controller_id, 0)))
 
 
 def encode_payload(receiver_id: int, sender_id: int, payload: bytes, send: ReplyMode) -> list[CanFrame]:

@@ -13,6 +13,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.report.numbers import number
 
 MAX_LINE_POINTS = 600
+INTERVAL_BAR_PX = (150, 18)
 
 
 def nice_ticks(low: float, high: float, max_steps: int = 5) -> list[float]:
@@ -38,7 +39,7 @@ def padded(values: ArrayLike, share: float = 0.06, min_margin: float = 1e-9) -> 
 
 
 class Chart:
-    """Axes with lines, dots, spans and text in data coordinates.
+    """Axes with lines, dots and spans in data coordinates.
 
     Args:
         title: Text for screen readers; not drawn.
@@ -120,14 +121,12 @@ class Chart:
                     f'<path class="stem {style}" d="M{self.px(a):.1f} {self.py(0.0):.1f}V{self.py(b):.1f}"/>'
                 )
 
-    def across(self, y: float, style: str, label: str = "") -> None:
-        """A level all the way across, with a label at its right end."""
+    def across(self, y: float, style: str) -> None:
+        """A level all the way across."""
         if not self._y[0] <= y <= self._y[1]:
             return
         right = self._size[0] - self._right
         self._back.append(f'<path class="level {style}" d="M{self._left:.1f} {self.py(y):.1f}H{right:.1f}"/>')
-        if label:
-            self.text(self._x[1], y, label, "end", -4.0)
 
     def spans(self, pieces: Sequence[tuple[float, float]], style: str) -> None:
         """Stretches of the abscissa, shaded from top to bottom."""
@@ -155,13 +154,6 @@ class Chart:
         """A circle in data coordinates, for charts with equal axes."""
         size = abs(self.px(x + radius) - self.px(x))
         self._back.append(f'<circle class="{style}" cx="{self.px(x):.1f}" cy="{self.py(y):.1f}" r="{size:.1f}"/>')
-
-    def text(self, x: float, y: float, text: str, anchor: str = "start", above: float = 0.0) -> None:
-        """Words at a place; ``above`` moves them [px], negative up."""
-        self._front.append(
-            f'<text class="note" x="{self.px(x):.1f}" y="{self.py(y) + above:.1f}" '
-            f'text-anchor="{anchor}">{escape(text)}</text>'
-        )
 
     def render(self) -> Markup:
         """The SVG element."""
@@ -191,14 +183,14 @@ class Chart:
         return Markup("".join(parts))
 
 
-def interval_bar(value: float, low: float, high: float, size: tuple[int, int] = (150, 18)) -> Markup:
+def interval_bar(value: float, low: float, high: float) -> Markup:
     """A number as a dot within its interval, on an axis that starts or ends at zero (drawn as a tick)."""
     if not all(math.isfinite(v) for v in (value, low, high)):
         return Markup("")
     left, right = min(low, 0.0), max(high, 0.0)
     if right - left <= 0.0:
         return Markup("")
-    wide, high_px = size
+    wide, high_px = INTERVAL_BAR_PX
     middle = high_px / 2
 
     def at(v: float) -> float:

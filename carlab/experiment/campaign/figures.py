@@ -189,7 +189,7 @@ class WindowPredictions:
     std: FloatArray
 
 
-def predict_windows(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> WindowPredictions:
+def predict_windows(dynamics: OneStep, episode: EpisodeData) -> WindowPredictions:
     """Predict consecutive windows of one second by draws of particles and noise; a shorter episode has no window."""
     history = dynamics.history
     length = max(round(HORIZON_S / episode.period_s), 1)
@@ -199,7 +199,7 @@ def predict_windows(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> W
         return WindowPredictions(np.zeros((0, length + 1), dtype=np.int64), empty, empty)
     past = episode.sent[starts[:, None] - np.arange(history, 0, -1)]
     commands = episode.sent[starts[:, None] + np.arange(length)]
-    paths = sample_paths(dynamics, episode.states[starts], past, commands, seed=seed)
+    paths = sample_paths(dynamics, episode.states[starts], past, commands, seed=0)
     return WindowPredictions(starts[:, None] + np.arange(length + 1), paths.mean(axis=2), paths.std(axis=2))
 
 
@@ -223,7 +223,6 @@ def predict_ahead(
     period_s: float,
     *,
     n_samples: int = 16,
-    seed: int = 0,
 ) -> PathsAhead:
     """Predict the paths of the next second by a policy in a learned car, without the slew limits of the safety gate.
 
@@ -233,9 +232,8 @@ def predict_ahead(
         features: encoded states and past commands at the starts (S, 7 + 2 H).
         period_s: control period [s].
         n_samples: sampled paths from each start.
-        seed: of the samples.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     rows = torch.from_numpy(features).float().repeat_interleave(n_samples, dim=0)
     rollouts = start_rollouts(dynamics, len(rows), generator)
     states = [decode_state(rows)]

@@ -57,7 +57,6 @@ class ExcitationPolicy:
         simulator: car file, for geometry, motor, grip and command delay.
         envelope: safety limits with the arena; commands stay within the limits.
         seed: seed of the commands.
-        settings: settings of the draws.
 
     Raises:
         ConfigError: the envelope has no arena.
@@ -65,19 +64,13 @@ class ExcitationPolicy:
 
     name = "excitation"
 
-    def __init__(
-        self,
-        simulator: SimulatorConfig,
-        envelope: SafetyEnvelope,
-        seed: int = 0,
-        settings: ExcitationSettings = ExcitationSettings(),
-    ) -> None:
+    def __init__(self, simulator: SimulatorConfig, envelope: SafetyEnvelope, seed: int = 0) -> None:
         if not envelope.arena_m:
             raise ConfigError("The policy excitation needs an arena; choose a task or a car file with one.")
         self._car = simulator.parameters
         self._delay_s = simulator.command_delay_s
         self._envelope = envelope
-        self._settings = settings
+        self._settings = ExcitationSettings()
         self._rng = np.random.default_rng(seed)
         self._action = NEUTRAL
         self._until_s = 0.0

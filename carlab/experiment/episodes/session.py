@@ -40,6 +40,9 @@ from carlab.recording.sink import LogLine
 
 log = logging.getLogger(__name__)
 
+STILL_MPS = 0.05
+"""Largest measured speed of a car that stands [m/s]."""
+
 
 @dataclass(slots=True)
 class Session:
@@ -234,13 +237,13 @@ def _objects_frozen() -> Iterator[None]:
         gc.unfreeze()
 
 
-def wait_until_still(car: Car, timeout_s: float = 3.0, speed_mps: float = 0.05) -> bool:
-    """Wait until the measured speed is at most ``speed_mps``; False after ``timeout_s`` of the car's clock."""
+def wait_until_still(car: Car, timeout_s: float = 3.0) -> bool:
+    """Wait until the measured speed is at most ``STILL_MPS``; False after ``timeout_s`` of the car's clock."""
     deadline_s = car.clock.now_s() + timeout_s
     while car.clock.now_s() <= deadline_s:
         with contextlib.suppress(PoseLostError):
             observation = car.observe()
-            if observation.velocity_valid and observation.state.speed_mps <= speed_mps:
+            if observation.velocity_valid and observation.state.speed_mps <= STILL_MPS:
                 return True
         car.clock.sleep_until(car.clock.now_s() + 0.02)
     return False

@@ -136,13 +136,13 @@ class McapSink(Sink):
         partial_path(self.path).rename(self.path)
 
 
-def write_episode(episode: EpisodeData, path: Path | str, run_metadata: Mapping[str, str] | None = None) -> None:
+def write_episode(episode: EpisodeData, path: Path | str) -> None:
     """Write an episode of arrays (for example an imported one) as a recording; ``read_episode`` is the inverse.
 
     Raises:
         DataError: The file exists or cannot be written.
     """
-    sink = McapSink(path, run_metadata)
+    sink = McapSink(path)
     names = [name for name in episode.extra if name not in OWN_COLUMNS]
     sink.open()
     try:
