@@ -79,7 +79,11 @@ def served(service: TrainingService, order: TrainingOrder, tmp_path: Path) -> tu
     events: list[LinkEvent] = []
     write_files(tmp_path / "order", order.files())
     request = LinkRequest(str(tmp_path / "order"), str(tmp_path / "result"))
-    run_order(service, request, events.append, LinkSettings(poll_s=0.05), wait)
+
+    def call(method: str, *arguments: Any) -> Any:
+        return getattr(service, method)(*arguments)
+
+    run_order(call, request, events.append, LinkSettings(poll_s=0.05), wait)
     return tmp_path / "result", events
 
 

@@ -6,7 +6,6 @@ The service is what runs on a cluster; only the transport differs.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from multiprocessing.managers import BaseManager
 from typing import Any
 
@@ -41,29 +40,14 @@ class RemoteService:
         manager.connect()
         self._service: Any = manager.service()  # type: ignore[attr-defined]
 
-    def _call(self, method: str, *arguments: Any) -> Any:
+    def call(self, method: str, *arguments: Any) -> Any:
         try:
             return getattr(self._service, method)(*arguments)
         except EOFError as error:
             raise ConnectionError("the connection is closed") from error
 
-    def missing(self, manifest: Mapping[str, str]) -> list[str]:
-        return list(self._call("missing", manifest))
-
-    def receive(self, content: bytes) -> None:
-        self._call("receive", content)
-
-    def begin(self, manifest: Mapping[str, str]) -> None:
-        self._call("begin", manifest)
-
-    def state(self) -> Mapping[str, Any]:
-        return dict(self._call("state"))
-
-    def fetch(self, name: str) -> bytes:
-        return bytes(self._call("fetch", name))
-
     def end(self) -> None:
-        self._call("stop")
+        self.call("stop")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
@@ -27,29 +27,15 @@ from carlab.jobs.ray_executor import connect, first_line
 NAMESPACE = "carlab"
 GOODBYE_S = 2.0
 Emit = Callable[[LinkEvent], None]
+Call = Callable[..., Any]
+"""Calls a method of ``TrainingService``, here or on the cluster: its name and arguments."""
 
 
 class Service(Protocol):
     """A ``TrainingService``, here or on the cluster."""
 
-    def missing(self, manifest: Mapping[str, str]) -> list[str]:
-        """As ``TrainingService.missing``."""
-        ...
-
-    def receive(self, content: bytes) -> None:
-        """As ``TrainingService.receive``."""
-        ...
-
-    def begin(self, manifest: Mapping[str, str]) -> None:
-        """As ``TrainingService.begin``."""
-        ...
-
-    def state(self) -> Mapping[str, Any]:
-        """As ``TrainingService.state``."""
-        ...
-
-    def fetch(self, name: str) -> bytes:
-        """As ``TrainingService.fetch``."""
+    def call(self, method: str, *arguments: Any) -> Any:
+        """The result of a method of ``TrainingService``, by its name."""
         ...
 
     def end(self) -> None:
@@ -84,8 +70,8 @@ class RayService:
             .remote(VERSION, device, settings.idle_s)
         )  # fmt: skip
 
-    def _call(self, method: str, *arguments: Any) -> Any:
-        """Call a method of the actor. Raises _LostWorkerError, _Refused or ConnectionError."""
+    def call(self, method: str, *arguments: Any) -> Any:
+        """The result of a method of the actor. Raises _LostWorkerError, _Refused or ConnectionError."""
         try:
             return self._ray.get(getattr(self._actor, method).remote(*arguments))
         except self._ray.exceptions.ActorUnavailableError as error:
@@ -96,26 +82,6 @@ class RayService:
             raise _LostWorkerError(first_line(error)) from error
         except self._ray.exceptions.RayError as error:
             raise ConnectionError(first_line(error)) from error
-
-    def missing(self, manifest: Mapping[str, str]) -> list[str]:
-        """As ``TrainingService.missing``."""
-        return list(self._call("missing", dict(manifest)))
-
-    def receive(self, content: bytes) -> None:
-        """As ``TrainingService.receive``."""
-        self._call("receive", content)
-
-    def begin(self, manifest: Mapping[str, str]) -> None:
-        """As ``TrainingService.begin``."""
-        self._call("begin", dict(manifest))
-
-    def state(self) -> Mapping[str, Any]:
-        """As ``TrainingService.state``."""
-        return dict(self._call("state"))
-
-    def fetch(self, name: str) -> bytes:
-        """As ``TrainingService.fetch``."""
-        return bytes(self._call("fetch", name))
 
     def end(self) -> None:
         """End the service on the cluster."""
@@ -131,12 +97,12 @@ class _LostWorkerError(Exception):
 
 
 def run_order(
-    service: Service, request: LinkRequest, emit: Emit, settings: LinkSettings, pause: Callable[[float], None]
+    call: Call, request: LinkRequest, emit: Emit, settings: LinkSettings, pause: Callable[[float], None]
 ) -> None:
     """Send the files of an order, wait for its training, and write the result.
 
     Args:
-        service: the training service.
+        call: calls a method of the training service by its name.
         request: folders of order and result.
         emit: receives what happens; the last event is ``done``, ``failed`` or ``lost worker``.
         settings: times of the link.
@@ -144,11 +110,11 @@ def run_order(
     """
     files = read_files(Path(request.order), ".")
     manifest = {name: sha256(content) for name, content in files.items()}
-    for name in service.missing(manifest):
-        service.receive(files[name])
+    for name in call("missing", manifest):
+        call("receive", files[name])
         emit(LinkEvent("answer"))
-    service.begin(manifest)
-    while (state := service.state())["state"] == "training":
+    call("begin", manifest)
+    while (state := call("state"))["state"] == "training":
         name, done, total = state["activity"]
         emit(LinkEvent("answer", activity=(name, done, total)))
         pause(settings.poll_s)
@@ -158,7 +124,7 @@ def run_order(
     there = {name: sha256(content) for name, content in read_files(Path(request.to), ".").items()}
     for name in RESULT_FILES:
         if there.get(name) != state["files"][name]:
-            write_files(Path(request.to), {name: service.fetch(name)})
+            write_files(Path(request.to), {name: call("fetch", name)})
             emit(LinkEvent("answer"))
     emit(LinkEvent("done"))
 
@@ -178,7 +144,7 @@ def serve(open_service: Callable[[], Service], requests: Iterable[str], emit: Em
         emit(LinkEvent("connected"))
         for line in requests:
             run_order(
-                service, LinkRequest.from_line(line), emit, settings,
+                service.call, LinkRequest.from_line(line), emit, settings,
                 lambda seconds: clock.sleep_until(clock.now_s() + seconds),
             )  # fmt: skip
     except _Refused as error:
@@ -203,7 +169,7 @@ def main(service_of: Callable[[str, str, str, LinkSettings], Service] = RayServi
 
     def open_service() -> Service:
         services.append(service_of(address, name, device, settings))
-        services[0].state()
+        services[0].call("state")
         return services[0]
 
     def emit(event: LinkEvent) -> None:
