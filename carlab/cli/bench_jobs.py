@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from carlab.cli.console import progress
+from carlab.cli.console import fail, progress
 from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, run_parallel
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 DATA, CAR, FIGURES = "data", "car.toml", "figures.json"
 """Names in the folder of a job: recordings, car file, and the figures that it writes."""
-SPEED_PERIOD_S = 86400.0
-"""Window over which the progress bar estimates its speed."""
+JOBS_SPEED_PERIOD_S, FITS_SPEED_PERIOD_S = 86400.0, 600.0
+"""Windows over which the progress bars of jobs and of fits estimate their speed."""
+Progress = Callable[[str, int, int], None]
+"""Called with the name of the next fit, the number of completed fits and the total number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,19 @@ class StudyJob(Generic[Result]):
             return self.read(end)
         except (KeyError, TypeError, ValueError) as error:
             return self.failed(end.failure or f"its result cannot be read ({error!r})")
+
+
+def reporting_job(
+    label: str, job: ChildJob, read: Callable[[JobEnd], list[Result]], failures: list[str]
+) -> StudyJob[Result]:
+    """A job without results if it fails; the message is printed and appended to ``failures``."""
+
+    def failed(reason: str) -> list[Result]:
+        failures.append(f"{label} failed: {reason}")
+        fail(failures[-1])
+        return []
+
+    return StudyJob(label, job, read, failed)
 
 
 def uses_jobs(options: BenchOptions) -> bool:
@@ -77,7 +92,7 @@ def run_jobs(
 
     found: dict[int, list[Result]] = {}
     executor_of_options = chosen_executor(options.ray, options.jobs, gpu=options.device == "cuda")
-    with Interrupts() as interrupts, executor_of_options as executor, progress(SPEED_PERIOD_S) as bar:
+    with Interrupts() as interrupts, executor_of_options as executor, progress(JOBS_SPEED_PERIOD_S) as bar:
         row = bar.add_task(name, total=len(jobs), note="")
 
         def on_end(number: int, end: JobEnd) -> None:
@@ -98,6 +113,39 @@ def run_jobs(
             finished=on_end,
         )
         return in_order(), len(found) < len(jobs)
+
+
+def run_study_parts(
+    here: Callable[[Progress, Callable[[], bool]], Iterator[Result]],
+    jobs: Callable[[], Sequence[StudyJob[Result]]],
+    options: BenchOptions,
+    name: str,
+    finished: Callable[[list[Result], list[Result]], None],
+) -> tuple[list[Result], bool]:
+    """Run a study in this process, or its parts as parallel jobs. ^C ends it after the running fits, a second at once.
+
+    Args:
+        here: starts the study in this process with callbacks for its progress and for ^C.
+        jobs: makes the jobs.
+        options: with the executor.
+        name: of the progress bar.
+        finished: as for ``run_jobs``; called after each result.
+
+    Returns:
+        As ``run_jobs``.
+    """
+    if uses_jobs(options):
+        return run_jobs(jobs(), options, name, finished)
+    results: list[Result] = []
+    with Interrupts(second_raises=True) as interrupts, progress(FITS_SPEED_PERIOD_S) as bar:
+        row = bar.add_task(name, total=None, note="")
+        stop = interrupts.requested.is_set
+        for result in here(lambda note, done, total: bar.update(row, completed=done, total=total, note=note), stop):
+            results.append(result)
+            finished([result], results)
+            if stop():
+                break
+        return results, stop()
 
 
 def bench_job(

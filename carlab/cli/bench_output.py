@@ -3,58 +3,24 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_jobs import StudyJob, read_figures, run_jobs
-from carlab.cli.console import console, fail, progress, table
+from carlab.cli.bench_jobs import StudyJob, read_figures
+from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
-from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.jobs.child_jobs import ChildJob
 from carlab.recording.atomic_files import write_json
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
     from carlab.studies.regression.scores import Row, Score
-    from carlab.studies.regression.study import Progress
-
-SPEED_PERIOD_S = 600.0
-"""Window over which the progress bar estimates its speed."""
 
 
 def command() -> str:
     """The current command line."""
     return " ".join(["carlab", *sys.argv[1:]])
-
-
-def run_and_write(
-    study: Callable[[Progress], Iterator[Score]], options: BenchOptions, name: str
-) -> tuple[list[Score], bool]:
-    """Run a study in this process, write the figures after each score, and print each failure.
-
-    Args:
-        study: function that starts the study with a progress callback.
-        options: with the file to write.
-        name: of the progress bar.
-
-    Returns:
-        The scores, and whether ^C ended the study.
-    """
-    scores: list[Score] = []
-    with Interrupts() as interrupts, progress(speed_estimate_period_s=SPEED_PERIOD_S) as bar:
-        task = bar.add_task(name, total=None, note="")
-        for score in study(lambda note, done, total: bar.update(task, completed=done, total=total, note=note)):
-            scores.append(score)
-            _write_scores([score], scores, options)
-            if interrupts.requested.is_set():
-                break
-        return scores, interrupts.requested.is_set()
-
-
-def run_jobs_and_write(jobs: Sequence[StudyJob[Score]], options: BenchOptions, name: str) -> tuple[list[Score], bool]:
-    """As ``run_and_write``, with the parts of the study as parallel jobs."""
-    return run_jobs(jobs, options, name, lambda new, scores: _write_scores(new, scores, options))
 
 
 def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[str]) -> StudyJob[Score]:
@@ -69,7 +35,7 @@ def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[
     )
 
 
-def _write_scores(new: Sequence[Score], scores: Sequence[Score], options: BenchOptions) -> None:
+def write_scores(new: Sequence[Score], scores: Sequence[Score], options: BenchOptions) -> None:
     """Write all scores, and print the failures among the new ones."""
     from carlab.studies.regression.scores import as_json
     from learning.devices import device_name

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from carlab.cli.bench_jobs import StudyJob, run_jobs, uses_jobs
+from carlab.cli.bench_jobs import StudyJob, reporting_job, run_jobs, uses_jobs
 from carlab.cli.bench_output import command
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
@@ -105,13 +105,8 @@ def _drive_as_jobs(runs: Sequence[_Run], started: Mapping[str, Path], options: B
     failures: list[str] = []
 
     def study_job(run: _Run) -> StudyJob[Path]:
-        def failed(reason: str) -> list[Path]:
-            failures.append(f"{run.label}, seed {run.seed} failed: {reason}")
-            fail(failures[-1])
-            return []
-
         job = _job(run, started.get(run.name), options)
-        return StudyJob(f"{run.label}, seed {run.seed}", job, lambda end: [_stored(end, options.runs)], failed)
+        return reporting_job(f"{run.label}, seed {run.seed}", job, lambda end: [_stored(end, options.runs)], failures)
 
     def is_complete(run: _Run) -> bool:
         return run.name in started and len(RunDirectory(started[run.name]).recordings()) >= options.episodes

@@ -6,13 +6,14 @@ import hashlib
 import itertools
 import tempfile
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.api.recordings import required_file
-from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, uses_jobs
+from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, run_study_parts
 from carlab.cli.bench_options import row_counts
-from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
+from carlab.cli.bench_output import report, score_job, write_scores
 from carlab.cli.console import console, progress
 from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError, DataError
@@ -51,18 +52,15 @@ def run_priors(options: BenchOptions) -> int:
         case = recorded_case([load_episodes(path) for path in files], car, options.history)
         console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
         priors = prior_models(case, simulator, diagnosed)
-        if uses_jobs(options):
-            scores, stopped = run_jobs_and_write(
-                _jobs(options, case, list(priors), files, car, model), options, "priors"
-            )
-            return report(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
-        scores, stopped = run_and_write(
-            lambda progress: run_prior_study(
+        scores, stopped = run_study_parts(
+            lambda progress, stop: run_prior_study(
                 case, priors, rows=row_counts(options), seeds=options.seeds, first_seed=options.first_seed,
                 steps=options.steps, device=options.device, progress=progress,
             ),
+            lambda: _jobs(options, case, list(priors), files, car, model),
             options,
             "priors",
+            partial(write_scores, options=options),
         )  # fmt: skip
         return report(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
 

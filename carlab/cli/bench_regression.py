@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, uses_jobs
+from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, run_study_parts
 from carlab.cli.bench_options import row_counts
-from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
+from carlab.cli.bench_output import report, score_job, write_scores
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console
 from carlab.cli.recordings import load_episodes
@@ -21,27 +22,22 @@ if TYPE_CHECKING:
 
 def run_regression(options: BenchOptions) -> int:
     """Fit every method to few rows, and print; the figures are written after each fit."""
-    case = _recorded(options) if options.case == "realcar" else options.case
-    if uses_jobs(options):
-        scores, stopped = run_jobs_and_write(_jobs(options, case), options, options.case)
-    else:
-        scores, stopped = _run_here(options, case)
-    structure = ", structured simulator for all methods" if options.structure else ""
-    return report(scores, stopped, options, f"{options.case}, {options.seeds} seeds{structure}", "method")
-
-
-def _run_here(options: BenchOptions, case: str | RecordedCase) -> tuple[list[Score], bool]:
     from carlab.studies.regression.study import run_study
 
-    return run_and_write(
-        lambda progress: run_study(
+    case = _recorded(options) if options.case == "realcar" else options.case
+    scores, stopped = run_study_parts(
+        lambda progress, stop: run_study(
             case, rows=row_counts(options), seeds=options.seeds, first_seed=options.first_seed, methods=options.methods,
             structure=options.structure, data=options.data, steps=options.steps, device=options.device,
             progress=progress,
         ),
+        lambda: _jobs(options, case),
         options,
         options.case,
+        partial(write_scores, options=options),
     )  # fmt: skip
+    structure = ", structured simulator for all methods" if options.structure else ""
+    return report(scores, stopped, options, f"{options.case}, {options.seeds} seeds{structure}", "method")
 
 
 def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Score]]:

@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_jobs import StudyJob, bench_job, read_figures, recorded_files, run_jobs, uses_jobs
+from carlab.cli.bench_jobs import StudyJob, bench_job, read_figures, recorded_files, reporting_job, run_study_parts
 from carlab.cli.bench_output import command
 from carlab.cli.bench_priors import recordings_in
-from carlab.cli.console import console, fail, progress, table
+from carlab.cli.console import console, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.cli.recordings import load_episodes
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
-from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.recording.atomic_files import write_json
 
 if TYPE_CHECKING:
@@ -28,7 +27,9 @@ if TYPE_CHECKING:
 
 def run_rollouts(options: BenchOptions) -> int:
     """Fit learned cars and their disturbances, and print coverage and error of their rollouts."""
+    from carlab.cars import load_car_file
     from carlab.studies.regression.recordings import recorded_case
+    from carlab.studies.rollouts import run_rollout_study
 
     if options.data is None:
         raise ConfigError("bench rollouts needs --data FOLDER with recordings of one car; add it.")
@@ -37,37 +38,23 @@ def run_rollouts(options: BenchOptions) -> int:
     case = recorded_case(recordings, options.car, options.history)
     console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
     failures: list[str] = []
-    if uses_jobs(options):
-        jobs = _jobs(options, case, recordings, files, failures)
-        scores, stopped = run_jobs(jobs, options, "rollouts", lambda new, scores: _write(scores, options))
-    else:
-        scores, stopped = _run_here(options, case, recordings)
+    curves_from = load_car_file(options.car).simulator if options.curves else None
+    scores, stopped = run_study_parts(
+        lambda progress, stop: run_rollout_study(
+            case, recordings, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
+            steps=options.steps, device=options.device, curves_from=curves_from, progress=progress, stop=stop,
+        ),
+        lambda: _jobs(options, case, recordings, files, failures),
+        options,
+        "rollouts",
+        lambda new, scores: _write(scores, options),
+    )  # fmt: skip
     _print(scores, files[-1].name)
     if options.out is not None:
         console.print(f"{options.out}")
     if stopped:
         return EXIT_INTERRUPTED
     return EXIT_FAILED if failures else 0
-
-
-def _run_here(options: BenchOptions, case: RecordedCase, recordings: Recordings) -> tuple[list[RolloutScore], bool]:
-    from carlab.cars import load_car_file
-    from carlab.studies.rollouts import run_rollout_study
-
-    scores: list[RolloutScore] = []
-    with Interrupts(second_raises=True) as interrupts, progress() as bar:
-        row = bar.add_task("rollouts", total=None, note="")
-        study = run_rollout_study(
-            case, recordings, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
-            steps=options.steps, device=options.device,
-            curves_from=load_car_file(options.car).simulator if options.curves else None,
-            progress=lambda note, done, total: bar.update(row, completed=done, total=total, note=note),
-            stop=interrupts.requested.is_set,
-        )  # fmt: skip
-        for score in study:
-            scores.append(score)
-            _write(scores, options)
-        return scores, interrupts.requested.is_set()
 
 
 def _jobs(
@@ -80,18 +67,9 @@ def _jobs(
     more += ["--curves"] if options.curves else []
 
     def job(rows: Rows, seed: int) -> StudyJob[RolloutScore]:
-        label = f"{rows} rows, seed {seed}"
-
-        def failed(reason: str) -> list[RolloutScore]:
-            failures.append(f"{label} failed: {reason}")
-            fail(failures[-1])
-            return []
-
-        return StudyJob(
-            label,
-            bench_job(options, rows, seed, more, contents),
-            lambda end: scores_from_json(read_figures(end)),
-            failed,
+        command = bench_job(options, rows, seed, more, contents)
+        return reporting_job(
+            f"{rows} rows, seed {seed}", command, lambda end: scores_from_json(read_figures(end)), failures
         )
 
     counts = checked_counts(case, recordings, options.rows, with_curves=options.curves)

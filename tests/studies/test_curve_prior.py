@@ -12,7 +12,7 @@ from linear_cars import linear_car
 
 import carlab.studies.curve_prior as curve_prior
 import carlab.studies.rollouts as study
-from carlab.cli import bench_rollouts, run
+from carlab.cli import bench_jobs, run
 from carlab.cli.bench_jobs import StudyJob
 from carlab.core.episode_data import EpisodeData
 from carlab.studies.curve_prior import unbroken_parts
@@ -86,7 +86,7 @@ def test_parallel_jobs_have_curves_too(folder: Path, monkeypatch: pytest.MonkeyP
         commands.extend(job.job.command for job in jobs)
         return [], False
 
-    monkeypatch.setattr(bench_rollouts, "run_jobs", run_jobs)
+    monkeypatch.setattr(bench_jobs, "run_jobs", run_jobs)
     command = ["bench", "rollouts", "--data", str(folder), "--seeds", "2", "--history", "3", "--car", "rc_car"]
     assert run([*command, "--curves", "--jobs", "2"]) == 0
     assert len(commands) == 2
