@@ -10,15 +10,15 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
+from carlab.cars import is_preset
+from carlab.cli.bench_options import BenchOptions
 from carlab.cli.console import fail, progress
 from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, run_parallel
-
-if TYPE_CHECKING:
-    from carlab.cli.bench_options import BenchOptions
+from carlab.jobs.ray_executor import chosen_executor
 
 Result = TypeVar("Result")
 DATA, CAR, FIGURES = "data", "car.toml", "figures.json"
@@ -88,8 +88,6 @@ def run_jobs(
     Returns:
         All results in the order of the study, and whether ^C ended it.
     """
-    from carlab.jobs.ray_executor import chosen_executor
-
     found: dict[int, list[Result]] = {}
     executor_of_options = chosen_executor(options.ray, options.jobs, gpu=options.device == "cuda")
     with Interrupts() as interrupts, executor_of_options as executor, progress(JOBS_SPEED_PERIOD_S) as bar:
@@ -175,8 +173,6 @@ def recorded_files(recordings: Sequence[Path], car: Path, history: int) -> tuple
         car: car file, or the name of a preset.
         history: number of past commands, so that no job estimates it again.
     """
-    from carlab.cars import is_preset
-
     files = {f"{DATA}/{path.name}": path.read_bytes() for path in recordings}
     given = ["--data", DATA, "--history", str(history), "--car", str(car)]
     if not is_preset(car):

@@ -5,17 +5,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from carlab.cli.bench_jobs import StudyJob, read_figures
+from carlab.cli.bench_options import BenchOptions
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.jobs.child_jobs import ChildJob
 from carlab.recording.atomic_files import write_json
-
-if TYPE_CHECKING:
-    from carlab.cli.bench_options import BenchOptions
-    from carlab.studies.regression.scores import Row, Score
+from carlab.studies.regression.picture import draw
+from carlab.studies.regression.scores import Row, Score, as_json, failed_score, scores_from_json, summarised
+from learning.devices import device_name
 
 
 def command() -> str:
@@ -25,8 +24,6 @@ def command() -> str:
 
 def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[str]) -> StudyJob[Score]:
     """A job that writes the scores of methods; if it fails, each method has a failed score."""
-    from carlab.studies.regression.scores import failed_score, scores_from_json
-
     return StudyJob(
         f"{', '.join(methods)}, {rows} rows, seed {seed}",
         job,
@@ -37,9 +34,6 @@ def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[
 
 def write_scores(new: Sequence[Score], scores: Sequence[Score], options: BenchOptions) -> None:
     """Write all scores, and print the failures among the new ones."""
-    from carlab.studies.regression.scores import as_json
-    from learning.devices import device_name
-
     if options.out is not None:
         device = f"{options.device} of Ray {options.ray}" if options.ray else device_name(options.device)
         write_json(options.out, as_json(scores, command(), device))
@@ -62,9 +56,6 @@ def report(scores: Sequence[Score], stopped: bool, options: BenchOptions, title:
     Returns:
         The exit code: interrupted, failed (at least one fit failed) or 0.
     """
-    from carlab.studies.regression.picture import draw
-    from carlab.studies.regression.scores import summarised
-
     rows = summarised(scores)
     print_rows(f"{title}{', interrupted' if stopped else ''}", first, rows)
     if options.out is not None:

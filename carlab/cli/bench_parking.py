@@ -8,22 +8,35 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 from carlab.cli.bench_jobs import StudyJob, reporting_job, run_jobs, uses_jobs
+from carlab.cli.bench_options import BenchOptions
 from carlab.cli.bench_output import command
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
+from carlab.cli.learn import Learn
+from carlab.cli.options import CarOptions
 from carlab.core.errors import ConfigError
 from carlab.core.json_files import plain
+from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd, read_files, write_files
 from carlab.jobs.child_processes import ONE_THREAD
 from carlab.recording.atomic_files import write_json
-
-if TYPE_CHECKING:
-    from carlab.cli.bench_options import BenchOptions
-    from carlab.studies.parking import Curve, MethodFigures
-    from carlab.studies.parking_realities import ArmFigures
+from carlab.recording.run_folder import RunDirectory
+from carlab.studies.parking import (
+    Curve,
+    MethodFigures,
+    as_json,
+    check_run,
+    draw,
+    read_curve,
+    run_folder,
+    run_name,
+    summarised,
+)
+from carlab.studies.parking_realities import ARMS, REALITIES, ArmFigures, arm_of, compared, write_reality
+from learning.world.car_fit import Method
 
 RUNS = "runs"
 """Folder of the runs in the folder of a job."""
@@ -46,8 +59,6 @@ class _Run:
     @property
     def name(self) -> str:
         """Last part of the name of its folder."""
-        from carlab.studies.parking import run_name
-
         return run_name(self.label, self.seed)
 
 
@@ -63,9 +74,6 @@ def run_parking(options: BenchOptions) -> int:
 
 def _started_runs(runs: Sequence[_Run], options: BenchOptions) -> dict[str, Path]:
     """Folders of the runs that exist, by name. Raises ConfigError if one was started with other options."""
-    from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
-    from carlab.studies.parking import check_run, run_folder
-
     started = {}
     for run in runs:
         folder = run_folder(options.runs, run.label, run.seed)
@@ -80,10 +88,6 @@ def _started_runs(runs: Sequence[_Run], options: BenchOptions) -> dict[str, Path
 
 def _drive_here(runs: Sequence[_Run], started: Mapping[str, Path], options: BenchOptions) -> int:
     """Start or resume the runs in this process; returns the exit code of the first that fails, or 0."""
-    from carlab.cli.learn import Learn
-    from carlab.cli.options import CarOptions
-    from carlab.studies.parking_realities import write_reality
-
     for run in runs:
         console.print(f"{run.label}, seed {run.seed}")
         reality = write_reality(run.reality, options.runs / "realities") if run.reality else None
@@ -100,8 +104,6 @@ def _drive_here(runs: Sequence[_Run], started: Mapping[str, Path], options: Benc
 
 def _drive_as_jobs(runs: Sequence[_Run], started: Mapping[str, Path], options: BenchOptions) -> int:
     """Start or resume the incomplete runs as parallel jobs; returns the exit code."""
-    from carlab.recording.run_folder import RunDirectory
-
     failures: list[str] = []
 
     def study_job(run: _Run) -> StudyJob[Path]:
@@ -121,8 +123,6 @@ def _drive_as_jobs(runs: Sequence[_Run], started: Mapping[str, Path], options: B
 
 def _job(run: _Run, started: Path | None, options: BenchOptions) -> ChildJob:
     """A run as a job: ``carlab learn``, with a copy of the run's folder if it exists."""
-    from carlab.studies.parking_realities import write_reality
-
     command = [*CARLAB, "learn", "--car", "sim", "--no-rerun", "--device", options.device]
     files: dict[str, bytes] = {}
     if run.reality:
@@ -156,8 +156,6 @@ def _stored(end: JobEnd, runs: Path) -> Path:
 
 def _curves(runs: Sequence[_Run], options: BenchOptions) -> list[Curve]:
     """Curves of the runs that exist, method by method; a longer run counts up to the last episode of the study."""
-    from carlab.studies.parking import read_curve, run_folder
-
     names = list(dict.fromkeys(run.method for run in runs))
     folders = [(run, run_folder(options.runs, run.label, run.seed)) for run in runs]
     curves = [
@@ -170,9 +168,6 @@ def _curves(runs: Sequence[_Run], options: BenchOptions) -> list[Curve]:
 
 def _runs(options: BenchOptions) -> list[_Run]:
     """All runs of the study, seed by seed."""
-    from carlab.studies.parking_realities import ARMS, REALITIES, arm_of
-    from learning.world.car_fit import Method
-
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     if options.realities is not None:
         if not 0 < options.realities <= len(REALITIES):
@@ -188,9 +183,6 @@ def _runs(options: BenchOptions) -> list[_Run]:
 
 def _report(curves: list[Curve], options: BenchOptions) -> None:
     """Print the tables, and write the figures and the picture."""
-    from carlab.studies.parking import as_json, draw, summarised
-    from carlab.studies.parking_realities import compared
-
     cars = "simulated car" if options.realities is None else f"{options.realities} simulated cars"
     table(
         f"Parking, {cars}, {options.seeds} seeds",

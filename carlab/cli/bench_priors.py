@@ -5,26 +5,24 @@ from __future__ import annotations
 import hashlib
 import itertools
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from carlab.api.recordings import required_file
+from carlab.cars import load_car_file
 from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, run_study_parts
-from carlab.cli.bench_options import row_counts
+from carlab.cli.bench_options import BenchOptions, row_counts
 from carlab.cli.bench_output import report, score_job, write_scores
 from carlab.cli.console import console, progress
+from carlab.cli.diagnose import Diagnose
 from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from carlab.cli.bench_options import BenchOptions
-    from carlab.studies.regression.recordings import RecordedCase
-    from carlab.studies.regression.scores import Score
+from carlab.studies.priors import checked_counts, prior_models, run_prior_study
+from carlab.studies.regression.recordings import RecordedCase, recorded_case
+from carlab.studies.regression.scores import Score
 
 MODEL = "model.toml"
 HOLDOUT_SHARE = 0.1
@@ -33,10 +31,6 @@ HOLDOUT_SHARE = 0.1
 
 def run_priors(options: BenchOptions) -> int:
     """Record or read recordings, diagnose all but the held-out one, fit a model under each prior, and print."""
-    from carlab.cars import load_car_file
-    from carlab.studies.priors import prior_models, run_prior_study
-    from carlab.studies.regression.recordings import recorded_case
-
     with ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         if options.out is not None:
@@ -69,8 +63,6 @@ def _jobs(
     options: BenchOptions, case: RecordedCase, priors: Sequence[str], files: Sequence[Path], car: Path, model: Path
 ) -> list[StudyJob[Score]]:
     """One job for each number of rows and seed, with all priors."""
-    from carlab.studies.priors import checked_counts
-
     recorded, contents = recorded_files(files, car, case.rows.history)
     contents[MODEL] = model.read_bytes()
     jobs = []
@@ -131,8 +123,6 @@ def _recordings(options: BenchOptions, work: Path) -> tuple[Path, list[Path], st
 
 def _diagnosed(files: Sequence[Path], car: Path, folder: Path) -> Path:
     """The car file of a diagnosis of recordings, with the end of each as its validation split."""
-    from carlab.cli.diagnose import Diagnose
-
     if Diagnose(tuple(files), car=str(car), out=folder, holdout_share=HOLDOUT_SHARE).run() != 0:
         console.print("The diagnosis is inconclusive; the diagnosed prior is the car file.")
     return folder / "model.toml"

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from carlab.api.diagnosis import diagnose
+from carlab.cli.bench_options import BenchOptions
 from carlab.cli.bench_output import command
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.runs import search_callbacks
 from carlab.core.errors import ConfigError
+from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.recording.atomic_files import write_json
-
-if TYPE_CHECKING:
-    from carlab.cli.bench_options import BenchOptions
+from carlab.studies.real_cars import as_json, real_car_errors, split_by_name
 
 
 def run_realcars(options: BenchOptions) -> int:
     """Diagnose the recordings to fit, and print the errors of all models on the held-out recordings."""
-    from carlab.api.diagnosis import diagnose
-    from carlab.diagnosis.report.events import diagnosed_event_sentences
-    from carlab.studies.real_cars import as_json, real_car_errors, split_by_name
-
     if options.data is None:
         raise ConfigError("bench realcars needs --data FOLDER with recordings of one car; add it.")
     files = {path.name: path for path in recordings_in(options.data)}

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, run_study_parts
-from carlab.cli.bench_options import row_counts
+from carlab.cli.bench_options import BenchOptions, row_counts
 from carlab.cli.bench_output import report, score_job, write_scores
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console
 from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from carlab.cli.bench_options import BenchOptions
-    from carlab.studies.regression.recordings import RecordedCase
-    from carlab.studies.regression.scores import Score
+from carlab.studies.regression.cases import CASES
+from carlab.studies.regression.recordings import RecordedCase, recorded_case
+from carlab.studies.regression.scores import Score
+from carlab.studies.regression.study import plan_study, run_study
 
 
 def run_regression(options: BenchOptions) -> int:
     """Fit every method to few rows, and print; the figures are written after each fit."""
-    from carlab.studies.regression.study import run_study
-
     case = _recorded(options) if options.case == "realcar" else options.case
     scores, stopped = run_study_parts(
         lambda progress, stop: run_study(
@@ -42,9 +38,6 @@ def run_regression(options: BenchOptions) -> int:
 
 def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Score]]:
     """One job for each fit."""
-    from carlab.studies.regression.cases import CASES
-    from carlab.studies.regression.study import plan_study
-
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     plan = plan_study(
         case,
@@ -73,8 +66,6 @@ def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Scor
 
 
 def _recorded(options: BenchOptions) -> RecordedCase:
-    from carlab.studies.regression.recordings import recorded_case
-
     files = _recordings(options)
     case = recorded_case([load_episodes(path) for path in files], options.car, options.history)
     console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)

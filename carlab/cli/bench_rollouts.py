@@ -5,9 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from carlab.cars import load_car_file
 from carlab.cli.bench_jobs import StudyJob, bench_job, read_figures, recorded_files, reporting_job, run_study_parts
+from carlab.cli.bench_options import BenchOptions
 from carlab.cli.bench_output import command
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, table
@@ -16,21 +17,14 @@ from carlab.cli.recordings import load_episodes
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.recording.atomic_files import write_json
+from carlab.studies.regression.recordings import RecordedCase, recorded_case
+from carlab.studies.rollouts import RolloutScore, Rows, as_json, checked_counts, run_rollout_study, scores_from_json
 
-if TYPE_CHECKING:
-    from carlab.cli.bench_options import BenchOptions
-    from carlab.studies.regression.recordings import RecordedCase
-    from carlab.studies.rollouts import RolloutScore, Rows
-
-    Recordings = Sequence[Sequence[EpisodeData]]
+Recordings = Sequence[Sequence[EpisodeData]]
 
 
 def run_rollouts(options: BenchOptions) -> int:
     """Fit learned cars and their disturbances, and print coverage and error of their rollouts."""
-    from carlab.cars import load_car_file
-    from carlab.studies.regression.recordings import recorded_case
-    from carlab.studies.rollouts import run_rollout_study
-
     if options.data is None:
         raise ConfigError("bench rollouts needs --data FOLDER with recordings of one car; add it.")
     files = recordings_in(options.data)
@@ -61,8 +55,6 @@ def _jobs(
     options: BenchOptions, case: RecordedCase, recordings: Recordings, files: Sequence[Path], failures: list[str]
 ) -> list[StudyJob[RolloutScore]]:
     """One job for each number of rows and seed; ``failures`` receives the messages of failed ones."""
-    from carlab.studies.rollouts import checked_counts, scores_from_json
-
     more, contents = recorded_files(files, options.car, case.rows.history)
     more += ["--curves"] if options.curves else []
 
@@ -78,8 +70,6 @@ def _jobs(
 
 
 def _write(scores: Sequence[RolloutScore], options: BenchOptions) -> None:
-    from carlab.studies.rollouts import as_json
-
     if options.out is not None:
         write_json(options.out, as_json(scores, command()))
 

@@ -5,25 +5,25 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import tomli_w
 
 from carlab.api.cars import load_car
 from carlab.api.recordings import load
+from carlab.benchmark.real.runner import RealProof
+from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, real_results_page, score_comparison
+from carlab.benchmark.world.measurement import COLUMNS
 from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, table
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import FloatArray
-
-if TYPE_CHECKING:
-    from carlab.benchmark.real.runner import RealProof
+from carlab.recording.csv.export import table_of
 
 
 def car_path(car: str, folder: Path) -> Path:
     """The car file, written to the folder if it is a preset."""
-    import tomli_w
-
     if not car:
         raise ConfigError("--set real needs the car file of the recordings; add --car FILE.")
     if Path(car).is_file():
@@ -43,9 +43,6 @@ def tables_in(folder: Path | None) -> dict[str, dict[str, FloatArray]]:
         ConfigError: no folder is given, or it does not exist.
         DataError: it has no recording.
     """
-    from carlab.benchmark.world.measurement import COLUMNS
-    from carlab.recording.csv.export import table_of
-
     if folder is None:
         raise ConfigError("--set real needs --data FOLDER with recordings of one car; add it.")
     tables = {}
@@ -69,8 +66,6 @@ def run_stages(proof: RealProof) -> bool:
 
 def score(proof: RealProof, out: Path, facts: Callable[[Mapping[str, Any]], dict[str, str]]) -> int:
     """Open the seal, score, print, and write scores.json and results.md."""
-    from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, real_results_page, score_comparison
-
     answers = proof.open_seal()
     console.print("The seal is intact: the answers match the hash.")
     runs, models = proof.reports(), proof.models()

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from carlab.core.errors import ConfigError
 from carlab.recording.atomic_files import write_text
@@ -71,8 +72,6 @@ class ArmFigures:
 
 def write_reality(name: str, folder: Path) -> Path:
     """Write the car file of a reality, and return its path. Raises DataError if it cannot be written."""
-    import tomli_w
-
     plain = replace(SimulatorConfig.from_preset(), priors={})
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.toml"

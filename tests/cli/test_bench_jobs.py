@@ -57,7 +57,7 @@ def given(job: ChildJob, option: str) -> str:
 def executor(monkeypatch: pytest.MonkeyPatch) -> FakeExecutor:
     """The executor that every ``--ray`` gets."""
     fake = FakeExecutor()
-    monkeypatch.setattr("carlab.jobs.ray_executor.chosen_executor", lambda ray, jobs, gpu: nullcontext(fake))
+    monkeypatch.setattr("carlab.cli.bench_jobs.chosen_executor", lambda ray, jobs, gpu: nullcontext(fake))
     return fake
 
 

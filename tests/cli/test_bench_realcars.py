@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 
-import carlab.api.diagnosis
 from carlab.cli import run
 from carlab.diagnosis.events import EventUse
 from carlab.diagnosis.report.write import JSON_NAME
@@ -61,7 +60,7 @@ def test_figures_are_printed_and_written(
             diagnosis=SimpleNamespace(events=EventUse(), held_out={}, held_out_with_events={}),
         )  # fmt: skip
 
-    monkeypatch.setattr(carlab.api.diagnosis, "diagnose", diagnose)
+    monkeypatch.setattr("carlab.cli.bench_realcars.diagnose", diagnose)
     out = folder.parent / "figures.json"
     command = ["bench", "realcars", "--data", str(folder), "--held-out", "b.csv", "c.csv", "--out", str(out)]
     command += ["--effects", "command_delay"]

@@ -164,7 +164,7 @@ def test_missing_data_is_reported_before_the_first_fit(tmp_path, monkeypatch):
 def test_invalid_options_are_refused_before_the_study(tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.json").mkdir()
-    monkeypatch.setattr("carlab.studies.regression.study.run_study", lambda *a, **k: pytest.fail("measured"))
+    monkeypatch.setattr("carlab.cli.bench_regression.run_study", lambda *a, **k: pytest.fail("measured"))
     assert run(["bench", *options.split()]) == 2
     printed = capsys.readouterr()
     assert message in " ".join((printed.out + printed.err).split())

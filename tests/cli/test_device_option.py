@@ -42,7 +42,7 @@ def test_figures_name_their_device(
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Imaginary 9000")
-    monkeypatch.setattr("carlab.studies.regression.study.run_study", log_device_and_run)
+    monkeypatch.setattr("carlab.cli.bench_regression.run_study", log_device_and_run)
     out = tmp_path / "study.json"
     small = ("--case", "pendulum", "--rows", 5, "--seeds", 1, "--methods", "ridge")
     code, _ = carlab("bench", "regression", *small, "--out", out, *options)

@@ -75,7 +75,7 @@ def test_run_trains_on_the_device_and_drives_on_the_cpu(
         return logged
 
     car = log_device("car", lambda dynamics, path: dynamics.posterior.parameters.device, save_car)
-    monkeypatch.setattr("learning.world.car_fit.save_car", car)
+    monkeypatch.setattr("carlab.experiment.campaign.training.save_car", car)
     policy = log_device("policy", lambda agent, folder: device_of(agent), SacAgent.save)
     monkeypatch.setattr(SacAgent, "save", policy)
     monkeypatch.setattr(campaign, "Session", log_device("driving", lambda car, policy, *_: device_of(policy), Session))

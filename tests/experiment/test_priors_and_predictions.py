@@ -13,6 +13,7 @@ import torch
 from carlab.cars import choose_car
 from carlab.core.episode_data import EpisodeData
 from carlab.core.safety import SafetyEnvelope
+from carlab.experiment.campaign import predicted_return
 from carlab.experiment.campaign.campaign import prior_simulator
 from carlab.experiment.campaign.figures import predict_windows
 from carlab.experiment.campaign.predicted_return import predicted_figures
@@ -21,7 +22,6 @@ from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.policy.sac_agent import SacAgent, SacSettings
 from learning.posterior.particle_posterior import ParticlePosterior
-from learning.world import model_env
 from learning.world.car_dynamics import CarDynamics
 from learning.world.model_env import RolloutEpisodes
 from sim_backends.car_parameters import SimulatorConfig, preset_names
@@ -106,7 +106,7 @@ def test_weight_of_drawn_cars_falls_with_the_number_of_episodes(
             count = len(self._returns)
             return RolloutEpisodes(self._returns, torch.zeros(count), torch.zeros(count, 13))
 
-    monkeypatch.setattr(model_env, "ModelEnv", lambda *args, **options: Cars(torch.zeros(64)))
+    monkeypatch.setattr(predicted_return, "ModelEnv", lambda *args, **options: Cars(torch.zeros(64)))
     plan = TrainingPlan(tomli_w.dumps(SimulatorConfig().to_tables()))
     agent = SacAgent(SacSettings(), 0)
     recordings = [recording_of(60)] * episodes

@@ -20,7 +20,7 @@ from carlab.core.errors import DataError, DivergedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.quantities import CarState
-from carlab.experiment.campaign import training
+from carlab.experiment.campaign import predicted_return, training
 from carlab.experiment.campaign.child_process import ChildError
 from carlab.experiment.campaign.training import SUCCESS_BONUS, train
 from carlab.experiment.campaign.training_plan import TrainingPlan
@@ -101,7 +101,7 @@ def test_diverged_training_is_repeated_with_a_smaller_learning_rate(
             raise DivergedError("The policy diverged.")
         return original_train(self, *arguments)
 
-    monkeypatch.setattr(car_fit, "fit_car", fit_car)
+    monkeypatch.setattr(training, "fit_car", fit_car)
     monkeypatch.setattr(SacAgent, "train", train_policy)
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     (tmp_path / "models").mkdir()
@@ -157,7 +157,8 @@ def test_training_has_a_larger_stopping_margin_and_a_parking_bonus_and_the_predi
             super().__init__(*arguments, **options)
             envs.append(self)
 
-    monkeypatch.setattr(model_env, "ModelEnv", CountedEnv)
+    for module in (training, predicted_return):
+        monkeypatch.setattr(module, "ModelEnv", CountedEnv)
     (tmp_path / "models").mkdir()
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)

@@ -16,7 +16,10 @@ from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import to_dict
 from carlab.diagnosis.findings import Diagnosis, FigureData
 from carlab.diagnosis.report import sentences as text
+from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
+from carlab.diagnosis.report.picture import draw_picture
+from carlab.diagnosis.report.rerun_recording import write_rrd
 from carlab.recording.atomic_files import write_text
 from carlab.recording.sink import make_folder, writing
 from sim_backends.car_parameters import SimulatorConfig
@@ -44,10 +47,6 @@ def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, mo
     Raises:
         DataError: the folder cannot be created or written; the message states reason and remedy.
     """
-    from carlab.diagnosis.report.html_page import render_page
-    from carlab.diagnosis.report.picture import draw_picture
-    from carlab.diagnosis.report.rerun_recording import write_rrd
-
     folder = Path(folder)
     complete = completed(diagnosis)
     report = json.dumps(complete.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -15,7 +15,10 @@ from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
+
+import rerun as rr
+import torch
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Document, EpisodeStarted, Tick
@@ -27,9 +30,6 @@ from carlab.experiment.campaign.run_recording import TICKS_BETWEEN_PATHS, Learne
 from carlab.recording.rerun.blueprint import LOG, send_blueprint
 from carlab.recording.rerun.run_recording import RunRecording, episode_number
 from carlab.recording.run_folder import RunDirectory
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 log = logging.getLogger(__name__)
 
@@ -113,9 +113,6 @@ class LiveView:
 
 def show(settings: LiveSettings, messages: Queue[Any]) -> None:
     """Show messages until None arrives or the process of the run ends; the main function of the view's process."""
-    import rerun as rr
-    import torch
-
     torch.set_num_threads(1)
     if hasattr(os, "nice"):
         os.nice(NICENESS)

@@ -8,21 +8,21 @@ learned car fits the recordings better, so the weight of the drawn cars falls wi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import ACTION_SIZE, STATE_FEATURES
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.toml_files import toml_tables
+from carlab.experiment.campaign.training_plan import TrainingPlan
+from learning.policy.sac_agent import SacAgent
+from learning.world.drawn_cars import draw_cars, select_cars
+from learning.world.model_env import ModelEnv
 from sim_backends.car_parameters import SimulatorConfig
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from carlab.experiment.campaign.training_plan import TrainingPlan
-    from learning.policy.sac_agent import SacAgent
-    from learning.world.model_env import ModelEnv
 
 N_DRAWN, N_SELECTED = 512, 64
 """Number of drawn cars, and of those that fit the recordings best."""
@@ -54,21 +54,14 @@ def predicted_figures(
         envelope: limits of the car's safety gate.
         seed: of all draws.
     """
-    import numpy as np
-    import torch
-
-    from learning.world import drawn_cars, model_env
-
     totals = [learned.roll_out(agent.act).returns.numpy()]
     shares = [1.0]
     prior = SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
     if plan.method == "gp-sim-posterior":
-        cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed), plan.history)
-        cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
+        cars = draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed), plan.history)
+        cars = select_cars(cars, episodes, N_SELECTED)
         task = plan.task.resized(cars.history)
-        environment = model_env.ModelEnv(
-            cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed
-        )
+        environment = ModelEnv(cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed)
         totals.append(environment.roll_out(lambda seen: agent.act(_own_features(seen, plan.history))).returns.numpy())
         drawn_share = FIRST_DRAWN_SHARE / (len(episodes) + 1) ** 2
         shares = [1.0 - drawn_share, drawn_share]
@@ -80,8 +73,6 @@ def predicted_figures(
 
 def _own_features(seen: NDArray[np.float32], history: int) -> NDArray[np.float32]:
     """Policy inputs (N, 7 + 2 H) with only the last H = ``history`` of the past commands in ``seen``."""
-    import numpy as np
-
     first = seen.shape[1] - ACTION_SIZE * history
     assert first >= STATE_FEATURES, f"{seen.shape[1]} features hold fewer than {history} past commands"
     return np.concatenate([seen[:, :STATE_FEATURES], seen[:, first:]], axis=1)

@@ -12,7 +12,11 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
@@ -30,20 +34,19 @@ from carlab.experiment.campaign.prior_correction_process import read_version
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.prediction.learned import drive_windows, recorded_windows
 from carlab.recording.episode_builder import VELOCITY_DELAY
+from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
+from carlab.recording.sink import describe_os_error
+from learning.functional_svgd.authors_fsvgd import STEPS, fit_authors_fsvgd
+from learning.policy.sac_agent import SacAgent, SacSettings
 from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
-from learning.world.car_fit import PAPER_METHODS, LearnedCar
+from learning.world.car_dynamics import CarDynamics
+from learning.world.car_fit import PAPER_METHODS, CarFitSettings, LearnedCar, fit_car, load_car, save_car
 from learning.world.history import find_history
+from learning.world.model_env import ModelEnv
+from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from learning.policy.sac_agent import SacAgent
-    from learning.world.car_dynamics import CarDynamics
-    from learning.world.car_fit import CarFitSettings
-    from learning.world.model_env import ModelEnv
 
 log = logging.getLogger(__name__)
 
@@ -110,10 +113,6 @@ def train(
             cannot be written.
         DivergedError: model or policy diverged twice.
     """
-    import torch
-
-    from learning.world.car_fit import load_car, save_car
-
     torch.set_num_threads(plan.threads)
     number = len(recordings) + 1
     progress("reading the recordings", 0, 1)
@@ -154,8 +153,6 @@ def train(
 
 def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[EpisodeData], EpisodeData | None]:
     """Recorded episodes with at least one complete transition, and the newest recording if it is one of them."""
-    from carlab.recording.mcap.source import has_ticks, read_episode
-
     episodes = [read_episode(path) if has_ticks(path) else None for path in recordings]
     usable = [e for e in episodes if e is not None and has_whole_step(e, history)]
     newest = usable[-1] if usable and usable[-1] is episodes[-1] else None
@@ -179,9 +176,6 @@ def _environments(
     plan: TrainingPlan, dynamics: LearnedCar, episodes: list[EpisodeData], envelope: SafetyEnvelope, seed: int
 ) -> tuple[ModelEnv, ModelEnv]:
     """Environments of the learned car for training and for evaluation; the latter has the task's reward alone."""
-    from learning.policy.sac_agent import SacSettings
-    from learning.world import model_env
-
     task = plan.task
     period_s = plan.control_period_s
     reaction_s = min(envelope.reaction_s + EXTRA_REACTION_S, SAFETY_BOUNDS.deadline.high)
@@ -193,8 +187,8 @@ def _environments(
         value: Tensor = SUCCESS_BONUS * task.tick_weight * task.success(features).to(features)
         return value - task.cost_weight * task.cost(features) if task.has_constraint else value
 
-    training = model_env.ModelEnv(dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, seed=seed, **gate)
-    return training, model_env.ModelEnv(dynamics, task, N_EVALUATION_CARS, seed=seed + 1, **gate)
+    training = ModelEnv(dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, seed=seed, **gate)
+    return training, ModelEnv(dynamics, task, N_EVALUATION_CARS, seed=seed + 1, **gate)
 
 
 def _predicted_figures(
@@ -206,8 +200,6 @@ def _predicted_figures(
     seed: int,
 ) -> dict[str, Any]:
     """``predicted_figures`` for the learned car with the safety gate of the driven car."""
-    from learning.world.model_env import ModelEnv
-
     period_s = plan.control_period_s
     learned = ModelEnv(
         dynamics, plan.task, N_EVALUATION_CARS, envelope=envelope, period_s=period_s, seed=seed + 2, device=plan.device
@@ -228,8 +220,6 @@ def _trained_policy(
         updates: gradient steps.
         progress: as for ``train``.
     """
-    from learning.policy.sac_agent import SacAgent, SacSettings
-
     task, sac = plan.task, SacSettings()
     sac = replace(sac, discount=sac.discount ** reference_ticks(plan.control_period_s))
     figures: dict[str, Any] = {}
@@ -268,10 +258,6 @@ def _fitted(
     progress: Progress,
 ) -> LearnedCar:
     """Fit the car by the method of the plan."""
-    from learning.functional_svgd.authors_fsvgd import STEPS, fit_authors_fsvgd
-    from learning.world.car_dynamics import CarDynamics
-    from learning.world.car_fit import CarFitSettings, fit_car
-
     is_papers = plan.method in PAPER_METHODS
     steps = plan.model_steps or (STEPS if is_papers else CarFitSettings().steps)
 
@@ -320,8 +306,6 @@ def _fitted_to_rollouts(
         rate_factor: factor on the learning rate.
         progress: as for ``train``.
     """
-    from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
-
     try:
         windows = drive_windows(recorded_windows(episodes, ROLLOUT_HORIZON_S, ROLLOUT_STRIDE_S), car.history)
     except DataError as error:
@@ -359,8 +343,6 @@ def _with_smaller_steps(learn: Callable[[float], Learned], what: str) -> Learned
 
 def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
     """Median delay of measured velocities in recordings [s]; without any, that of the state estimator."""
-    import numpy as np
-
     delays = [np.asarray(e.extra[VELOCITY_DELAY], dtype=np.float64) for e in episodes if VELOCITY_DELAY in e.extra]
     known = np.concatenate([d[np.isfinite(d)] for d in delays]) if delays else np.zeros(0)
     return float(np.median(known)) if len(known) else 0.5 * StateEstimator().window_s
@@ -368,16 +350,12 @@ def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
 
 def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
     """Features (R, 7 + 2 H) of recorded states with the H commands before each."""
-    import numpy as np
-
     features = np.concatenate([episode_features(e.states, e.sent, history)[history : e.ticks] for e in episodes])
     finite: FloatArray = features[np.isfinite(features).all(axis=1)]
     return finite
 
 
 def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None]) -> None:
-    from carlab.recording.sink import describe_os_error
-
     unfinished = folder.with_name(f"{folder.name}.partial")
     try:
         shutil.rmtree(unfinished, ignore_errors=True)
