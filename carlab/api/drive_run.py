@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from carlab.api.runs import figure_names, html_picture, html_table
 from carlab.core.errors import add_sentence
 from carlab.core.outcome import EndReason
+from carlab.experiment.episodes.result import EpisodeResult
 
 if TYPE_CHECKING:
-    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 log = logging.getLogger(__name__)

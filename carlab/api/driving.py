@@ -32,13 +32,13 @@ from carlab.core.quantities import CarState, Reality
 from carlab.core.task import ParkingTask, RecordedTask, Task
 from carlab.experiment.episodes.hooks import RunHooks
 from carlab.experiment.episodes.interrupts import Interrupts, check_main_thread
+from carlab.experiment.episodes.result import EpisodeResult
 from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
     from carlab.core.safety import SafetyEnvelope
     from carlab.core.task_choice import TaskChoice
-    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
     from sim_backends.car_parameters import SimulatorConfig
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from carlab.api.cars import car_name, car_options_text
 from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
@@ -102,8 +104,6 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
 
 def _check_extent(task: Task) -> None:
     """Raise ConfigError if start, goal or path lie beyond the positions that a policy observes."""
-    import numpy as np
-
     from learning.world.model_env import FEATURE_UNITS, MAX_POLICY_INPUT
 
     limit_m = MAX_POLICY_INPUT * FEATURE_UNITS[0]

@@ -40,6 +40,7 @@ from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.cluster.settings import LinkSettings
 from carlab.experiment.episodes.hooks import RunHooks
 from carlab.experiment.episodes.interrupts import Interrupts, check_main_thread
+from carlab.experiment.episodes.result import EpisodeResult
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign.live_view import LiveView
     from carlab.experiment.campaign.quick_check import EpisodeCheck
     from carlab.experiment.cluster.trainer import ClusterTrainer
-    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 EPISODES = 20

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 from carlab.api.recordings import Recording, is_csv, load, required_file
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
@@ -154,8 +156,6 @@ def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: Loade
 
 def _check_arrays(episode: EpisodeData) -> None:
     """Raise DataError if times do not increase or are not in seconds, or if commands exceed [-1, 1]."""
-    import numpy as np
-
     from carlab.recording.audit.file_checks import MAX_COMMAND, MAX_PERIOD_S
 
     if not np.all(np.diff(episode.times_s) > 0.0):
@@ -172,8 +172,6 @@ def _check_arrays(episode: EpisodeData) -> None:
 
 def _without_corrupt_numbers(episode: EpisodeData) -> EpisodeData:
     """The episode with NaN for states that no car has, and without such poses."""
-    import numpy as np
-
     from carlab.recording.audit.file_checks import MAX_NUMBER
 
     is_plausible = np.abs(episode.states) <= MAX_NUMBER

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from carlab.api.runs import html_table
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
+from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
 from carlab.recording.episode_builder import RECOVERY
 
 if TYPE_CHECKING:
     from carlab.recording.audit.report import AuditReport
-    from carlab.recording.column_mapping import ColumnMapping
 
 CSV_ENDINGS = (".csv", ".csv.gz")
 
@@ -220,7 +220,6 @@ def resolved_mapping(
     Raises:
         ConfigError: the mapping file or an option is invalid.
     """
-    from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
     from carlab.recording.csv.table import read_csv
 
     columns: dict[str, dict[str, Any]] = {}

@@ -21,12 +21,12 @@ from carlab.core.errors import ConfigError, DataError, NotReadyError
 from carlab.core.json_files import read_json
 from carlab.core.version import VERSION
 from carlab.experiment.episodes.hooks import RunHooks
+from carlab.experiment.episodes.result import EpisodeResult
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
 
     from carlab.cars import CarChoice
-    from carlab.experiment.episodes.result import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 P = ParamSpec("P")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.core.errors import ConfigError
+from carlab.core.keep_out import Corners
 from carlab.core.task import Task
 from carlab.experiment.episodes.task_check import check_task
 
 if TYPE_CHECKING:
-    from carlab.core.keep_out import Corners
     from carlab.core.task_choice import TaskChoice
     from carlab.core.track import Track
 

@@ -17,9 +17,12 @@ from carlab.core.errors import CarlabError, ConfigError
 from carlab.core.geofence import stopping_distance_m
 from carlab.core.quantities import Action, ActionLimits, CarState, Reality
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.state_estimator import StateEstimator
 from carlab.core.track import Track
 from drivers.config import ActuatorConfig
 from sim_backends.car_parameters import SimulatorConfig, preset_names
+from sim_backends.plant import Plant
+from sim_backends.simulated_car import SimulatedCar
 
 _LOG = logging.getLogger(__name__)
 PLUGIN_GROUP = "carlab.cars"
@@ -154,7 +157,6 @@ def _check_watchdog(choice: CarChoice) -> None:
 def _warn_of_coasting(choice: CarChoice) -> None:
     """Warn if a real car that does not brake in neutral coasts further than the geofence assumes, by its car file."""
     from drivers.hardware_car import HardwareCar
-    from sim_backends.plant import Plant
 
     car, envelope = choice.car, choice.envelope
     if not isinstance(car, HardwareCar) or car.config.calibration.neutral_brake_a > 0.0:
@@ -189,8 +191,6 @@ def _config_toml(file: CarFile, car: str) -> str:
 
 
 def _simulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
-    from sim_backends.simulated_car import SimulatedCar
-
     watchdog_s = _actuator(file).watchdog_s
     # The period of the control loop is that of the car file.
     simulator = replace(truth or file.simulator, control_period_s=file.simulator.control_period_s)
@@ -217,7 +217,6 @@ def _emulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None, ac
 
 
 def _real(file: CarFile, seed: int) -> CarChoice:
-    from carlab.core.state_estimator import StateEstimator
     from drivers.actuator import Actuator
     from drivers.hardware_car import HardwareCar
     from mocap.rigid_body import RigidBodyPoseSource

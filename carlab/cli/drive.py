@@ -6,11 +6,11 @@ import math
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
+from carlab.api.drive_run import DriveRun
 from carlab.api.driving import drive
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, fail, progress, table
@@ -20,9 +20,6 @@ from carlab.cli.runs import common_hooks, figure_text, heading
 from carlab.core.documents import Tick
 from carlab.core.outcome import EndReason
 from carlab.experiment.episodes.hooks import RunHooks
-
-if TYPE_CHECKING:
-    from carlab.api.drive_run import DriveRun
 
 
 @dataclass

@@ -9,6 +9,8 @@ from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
+from docstring_parser import parse
+from docstring_parser.attrdoc import AttributeDocstrings
 
 MARK = "\n\nArgs:\n"
 EMPTY_DEFAULTS = ("", "''", "None")
@@ -47,15 +49,11 @@ def _option_names(option_class: type) -> list[str]:
 
 def attribute_texts(option_class: type) -> dict[str, str]:
     """The text after each attribute of a class that has one."""
-    from docstring_parser.attrdoc import AttributeDocstrings
-
     return {name: text for name, (text, *_) in AttributeDocstrings().get_attr_docs(option_class).items() if text}
 
 
 def _argument_texts(option_class: type) -> dict[str, str]:
     """Texts of the arguments of the class's calls, with the names of options; "as for ..." counts as no text."""
-    from docstring_parser import parse
-
     names = _option_names(option_class)
 
     def as_option(match: re.Match[str]) -> str:

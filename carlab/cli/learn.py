@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from carlab.api.driving import drive
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method
-from carlab.api.learning import learn
+from carlab.api.learning import LearnRun, learn
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
@@ -24,7 +24,6 @@ from carlab.core.documents import Tick
 from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
-    from carlab.api.learning import LearnRun
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.quick_check import EpisodeCheck
 

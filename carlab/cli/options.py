@@ -9,7 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args
+
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from carlab.api.cars import car_options_text
 from carlab.api.driving import drive
@@ -18,9 +20,6 @@ from carlab.core.errors import ConfigError, DataError
 ARGUMENT_DEFAULT: Any = object()
 """Stands for the default of the argument with the name of the option (``options_of``)."""
 T = TypeVar("T")
-
-if TYPE_CHECKING:
-    from tyro.constructors import ConstructorRegistry
 
 
 def options_of(*calls: Callable[..., Any]) -> Callable[[type[T]], type[T]]:
@@ -84,8 +83,6 @@ def arguments_of(verb: Any, call: Callable[..., Any]) -> dict[str, Any]:
 
 def registry_without_none() -> ConstructorRegistry:
     """Rules of tyro in which ``None`` is no value of an option: an option is ``None`` only if it is not given."""
-    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
-
     registry = ConstructorRegistry()
 
     @registry.primitive_rule

@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from rich.progress import Progress, TaskID
+
 from carlab.api.arguments import above_zero, at_least, valid_seed
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED
@@ -22,8 +24,6 @@ from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.jobs.child_jobs import CARLAB
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from carlab.benchmark.cases.proof_set import CaseSpec
     from carlab.benchmark.proof.runner import Proof
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from carlab.api.arguments import above_zero, valid_seed
 from carlab.api.driving import replay
-from carlab.api.prediction import predict
+from carlab.api.prediction import PredictionErrors, predict
 from carlab.api.recordings import load
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
@@ -23,9 +23,6 @@ from carlab.core.errors import ConfigError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 from carlab.experiment.episodes.hooks import RunHooks
-
-if TYPE_CHECKING:
-    from carlab.api.prediction import PredictionErrors
 
 
 @dataclass

@@ -8,7 +8,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.progress import Progress
 
 from carlab.cli.console import banner, console, fail, progress
 from carlab.cli.exit_codes import EXIT_SAFETY_STOP
@@ -17,9 +19,6 @@ from carlab.core.errors import ConfigError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import CarState
 from carlab.experiment.episodes.interrupts import Interrupts
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 
 def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:

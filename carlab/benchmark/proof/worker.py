@@ -14,6 +14,7 @@ from typing import Any
 
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.seal import file_digest
+from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.core.errors import DataError
 
@@ -50,7 +51,6 @@ def make(order: dict[str, Any]) -> None:
 def baselines(order: dict[str, Any]) -> None:
     """Run every baseline on the case in the working directory with its noise ``floor``, and write the results."""
     from carlab.benchmark.baselines.run import require_studies, run_baselines
-    from carlab.benchmark.world.base_car import BaseCar
 
     require_studies()
     fit, hold, car = map(Path, FILES)

@@ -27,8 +27,11 @@ from carlab.experiment.campaign.prior_correction import (
 )
 from carlab.experiment.campaign.quick_check import CHECK_FILE, MIN_DIAGNOSIS_EPISODES
 from carlab.recording.atomic_files import write_json
+from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import confusable_effects
+from sim_backends.registry import REGISTRY
 
 if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
@@ -99,8 +102,6 @@ def run_correction_subprocess(
 
 def correct_prior(request: CorrectionRequest) -> PriorVersion:
     """The next version of the prior. Raises CarlabError if a recording cannot be read."""
-    from carlab.recording.mcap.source import has_ticks, read_episode
-
     car = SimulatorConfig.from_tables(toml_tables(request.car_toml))
     episodes = [read_episode(path) for path in request.recordings if has_ticks(path)]
     number = len(request.recordings)
@@ -150,7 +151,6 @@ def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorCo
     from carlab.diagnosis.recordings import Inconclusive
     from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.state_alignment import align_states
-    from sim_backends.effects import confusable_effects
 
     aligned = [align_states(e, car.latency_s()) for e in episodes]
     held_out = aligned[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
@@ -189,8 +189,6 @@ def corrections_of(diagnosis: Diagnosis, model: SimulatorConfig, episodes: int) 
 
 
 def _valid(std: dict[str, float], values: dict[str, float]) -> dict[str, float]:
-    from sim_backends.registry import REGISTRY
-
     return {
         name: s
         for name, s in std.items()

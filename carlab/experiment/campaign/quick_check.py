@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from carlab.core.errors import DataError
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.child_process import ChildError, run_in_child
 from carlab.recording.atomic_files import write_json
+from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -60,8 +63,6 @@ def run_check_subprocess(
 
     The result is written to the model folder of the last episode, the simulator to ``simulator.toml`` of the run.
     """
-    import tomli_w
-
     recordings = run.recordings()
     number = len(recordings)
     path = check_path(run, number)
@@ -90,7 +91,6 @@ def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict
     """
     from carlab.diagnosis.quick.quick_check import quick_check
     from carlab.diagnosis.quick.sentences import sentences, short
-    from carlab.recording.mcap.source import has_ticks, read_episode
 
     driven = [path for path in recordings if has_ticks(path)]
     result = quick_check([read_episode(path) for path in driven], simulator)
