@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from learning_runs import ENVELOPE, TICKS, drive, small_plan
 
-from carlab.experiment.campaign.training import train
+from carlab.experiment.campaign.training import TrainingRequest, train
 from carlab.experiment.cluster.order import TrainingOrder
 from carlab.jobs.child_jobs import write_files
 from carlab.recording.run_folder import RunDirectory
@@ -29,7 +29,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> RunDirectory:
     """A run with one recording, and the models before its first and second episode."""
     run = drive(tmp_path_factory.mktemp("trained"), TICKS)
     for recordings in ([], run.recordings()):
-        train(small_plan(), run.models, recordings, ENVELOPE, lambda *what: None)
+        train(TrainingRequest(small_plan(), run.models, recordings, ENVELOPE), lambda *what: None)
     return run
 
 

@@ -16,7 +16,7 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action
 from carlab.experiment.campaign.campaign import Campaign
 from carlab.experiment.campaign.hooks import LearnHooks
-from carlab.experiment.campaign.training import train
+from carlab.experiment.campaign.training import TrainingRequest, train
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import read_log
@@ -38,7 +38,7 @@ def test_recorded_command_equals_the_command_received_by_the_firmware(
     run = RunDirectory.create(tmp_path, "wire")
     choice = choose_car("emulated", seed=0)
     plan = tiny_plan(choice)
-    train(plan, run.models, [], ENVELOPE, lambda *what: None)
+    train(TrainingRequest(plan, run.models, [], ENVELOPE), lambda *what: None)
     choice.log_to(run.path)
     sent_actions = log_sent_actions(choice)
     with choice.car:

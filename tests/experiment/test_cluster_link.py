@@ -29,6 +29,7 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Tick
 from carlab.experiment.campaign.campaign import Campaign
 from carlab.experiment.campaign.hooks import LearnHooks
+from carlab.experiment.campaign.training import TrainingRequest
 from carlab.experiment.campaign.training_process import train_in_subprocess
 from carlab.experiment.cluster.link_process import LinkProcess
 from carlab.experiment.cluster.settings import LinkSettings
@@ -146,9 +147,9 @@ def learn_with_cuts(cluster: Cluster, tmp_path: Path) -> LearningRun:
         if run.results == 2:
             cluster.network.restore()
 
-    def train_here(plan: Any, models: Path, recordings: list[Path], *others: Any) -> dict[str, Any] | None:
-        run.here.append(len(recordings) + 1)
-        return train_in_subprocess(plan, models, recordings, *others)
+    def train_here(request: TrainingRequest, *others: Any) -> dict[str, Any] | None:
+        run.here.append(request.number)
+        return train_in_subprocess(request, *others)
 
     hooks = LearnHooks(
         on_tick=on_tick, on_episode=lambda number, ticks: run.ticks_s.append([]), on_training=on_training

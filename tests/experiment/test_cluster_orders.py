@@ -112,11 +112,11 @@ def test_new_order_ends_the_running_one(monkeypatch: pytest.MonkeyPatch, run: Ru
     started: list[int] = []
     stopped: list[int] = []
 
-    def train_until_stopped(plan: Any, models: Any, recordings: Any, envelope: Any, progress: Any, stop: Any) -> None:
-        started.append(plan.seed)
+    def train_until_stopped(order: TrainingOrder, progress: Any, stop: Any) -> None:
+        started.append(order.plan.seed)
         while not stop():
             wait(0.01)
-        stopped.append(plan.seed)
+        stopped.append(order.plan.seed)
 
     monkeypatch.setattr("carlab.experiment.cluster.service.train_in_subprocess", train_until_stopped)
     service = TrainingService(VERSION)

@@ -15,7 +15,7 @@ from learning_runs import ENVELOPE, small_plan
 
 from carlab.core.clock import SimulatedClock
 from carlab.core.errors import ConfigError, DataError
-from carlab.experiment.campaign.training import train
+from carlab.experiment.campaign.training import TrainingRequest, train
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
 from carlab.experiment.cluster.order import TrainingOrder
@@ -86,8 +86,8 @@ class Here:
     def __init__(self) -> None:
         self.plans: list[TrainingPlan] = []
 
-    def __call__(self, plan: TrainingPlan, *others: Any) -> dict[str, Any] | None:
-        self.plans.append(plan)
+    def __call__(self, request: TrainingRequest, *others: Any) -> dict[str, Any] | None:
+        self.plans.append(request.plan)
         return {"trained": "here"}
 
 
@@ -98,7 +98,7 @@ def trainer_of(link: FakeLink) -> tuple[ClusterTrainer, list[str], Here]:
 
 
 def start(trainer: ClusterTrainer, run: RunDirectory, **options: Any) -> dict[str, Any] | None:
-    return trainer(small_plan(), run.models, run.recordings(), ENVELOPE, lambda *what: None, **options)
+    return trainer(TrainingRequest(small_plan(), run.models, run.recordings(), ENVELOPE), lambda *what: None, **options)
 
 
 DONE = [(1.0, LEARNING), (3.0, LinkEvent("done"))]
@@ -109,7 +109,9 @@ def test_result_of_the_cluster_is_the_model_of_the_run(trained: RunDirectory, ru
     trainer, said, here = trainer_of(link)
     progress: list[tuple[str, int, int]] = []
     figures = trainer(
-        small_plan(), run.models, run.recordings(), ENVELOPE, lambda *what: progress.append(what), lambda: False
+        TrainingRequest(small_plan(), run.models, run.recordings(), ENVELOPE),
+        lambda *what: progress.append(what),
+        lambda: False,
     )
     assert figures == json.loads((trained.models / "0002" / "training.json").read_text())
     for name in ("dynamics.pt", "policy.npz", "prior.toml", "training.json"):
@@ -214,7 +216,11 @@ def test_training_here_uses_a_device_of_this_computer(run: RunDirectory) -> None
     if torch.cuda.is_available():
         pytest.skip("this computer has a CUDA device")
     trainer, _, here = trainer_of(FakeLink())
-    trainer(small_plan(device="cuda"), run.models, run.recordings(), ENVELOPE, lambda *what: None, lambda: False)
+    trainer(
+        TrainingRequest(small_plan(device="cuda"), run.models, run.recordings(), ENVELOPE),
+        lambda *what: None,
+        lambda: False,
+    )
     assert [plan.device for plan in here.plans] == ["cpu"]
 
 
@@ -254,7 +260,7 @@ class Payload:
 
 def other_history(folder: Path, created: Path) -> None:
     order = TrainingOrder(small_plan(history=3), folder.parent / "other", (), ENVELOPE)
-    train(order.plan, order.models, [], ENVELOPE, lambda *what: None)
+    train(TrainingRequest(order.plan, order.models, [], ENVELOPE), lambda *what: None)
     files = order.result()
     write_files(folder, {name: files[name] for name in ("dynamics.npz", "policy.npz")})
 

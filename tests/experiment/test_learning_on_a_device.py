@@ -29,8 +29,8 @@ SMALL = {"history": 1, "model_steps": 20, "updates": 8, "ticks": 6, "threads": 1
 def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few draws and steps; training in this process, where the stand-in of the device is installed."""
 
-    def train_here(plan: Any, models: Any, recordings: Any, envelope: Any, on_progress: Any, stop: Any) -> Any:
-        return training.train(plan, models, recordings, envelope, on_progress)
+    def train_here(request: Any, on_progress: Any, stop: Any) -> Any:
+        return training.train(request, on_progress)
 
     monkeypatch.setattr(campaign, "train_in_subprocess", train_here)
     monkeypatch.setattr("carlab.experiment.campaign.predicted_return.LONGER_EPISODE_FACTORS", (1.5,))

@@ -22,7 +22,7 @@ from carlab.core.observation import encode
 from carlab.core.quantities import CarState
 from carlab.experiment.campaign import predicted_return, training
 from carlab.experiment.campaign.child_process import ChildError
-from carlab.experiment.campaign.training import SUCCESS_BONUS, train
+from carlab.experiment.campaign.training import SUCCESS_BONUS, TrainingRequest, train
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.campaign.training_process import TrainingDiedError, train_in_subprocess
 from carlab.prediction.learned import drive_windows, recorded_windows
@@ -53,9 +53,9 @@ def test_model_uses_the_velocity_delay_of_the_recordings(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(training, "_fitted", stop_fit)
     with pytest.raises(DataError, match="fit is not needed"):
-        train(plan, tmp_path / "none", [], ENVELOPE, lambda *what: None)
+        train(TrainingRequest(plan, tmp_path / "none", [], ENVELOPE), lambda *what: None)
     with pytest.raises(DataError, match="fit is not needed"):
-        train(plan, tmp_path / "some", run.recordings(), ENVELOPE, lambda *what: None)
+        train(TrainingRequest(plan, tmp_path / "some", run.recordings(), ENVELOPE), lambda *what: None)
     assert delays_s == pytest.approx([0.025, 0.025], abs=1e-3)
     with_delays = replace(
         read_episode(run.episode_path(1)), extra={"velocity_delay_s": np.array([0.01, 0.02, np.nan, 0.04])}
@@ -76,7 +76,9 @@ def test_history_length_is_selected_after_three_episodes(tmp_path: Path, monkeyp
     monkeypatch.setattr(training, "find_history", find)
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     recordings = drive(tmp_path, TICKS, episodes=3).recordings()
-    figures = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
+    figures = [
+        train(TrainingRequest(plan, tmp_path / str(n), recordings[:n], ENVELOPE), lambda *what: None) for n in (2, 3)
+    ]
     assert episode_counts == [3]
     assert [f.get("supported_history") for f in figures] == [None, 6]
     assert "supports 6 past commands" in figures[1]["history_message"]
@@ -105,14 +107,14 @@ def test_diverged_training_is_repeated_with_a_smaller_learning_rate(
     monkeypatch.setattr(SacAgent, "train", train_policy)
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     (tmp_path / "models").mkdir()
-    train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
+    train(TrainingRequest(plan, tmp_path / "models", [], ENVELOPE), lambda *what: None)
     assert all(second == 0.25 * first for first, second in rates.values())
     assert "The model diverged" in caplog.text
     assert "The policy diverged" in caplog.text
     diverging.add("always")
     (tmp_path / "other").mkdir()
     with pytest.raises(DivergedError, match="with a smaller learning rate") as error:
-        train(plan, tmp_path / "other", [], ENVELOPE, lambda *what: None)
+        train(TrainingRequest(plan, tmp_path / "other", [], ENVELOPE), lambda *what: None)
     assert "\n" not in str(error.value)
     assert list((tmp_path / "other").iterdir()) == []
 
@@ -139,7 +141,9 @@ def test_too_short_episode_gives_no_training_rows(tmp_path: Path) -> None:
     run = drive(tmp_path, HISTORY)
     stages: list[str] = []
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    figures = train(plan, run.models, run.recordings(), ENVELOPE, lambda stage, done, total: stages.append(stage))
+    figures = train(
+        TrainingRequest(plan, run.models, run.recordings(), ENVELOPE), lambda stage, done, total: stages.append(stage)
+    )
     assert figures["rows"] == 0
     assert "last_episode_nll" not in figures
     assert json.loads((run.models / "0002" / "training.json").read_text()) == figures
@@ -161,7 +165,7 @@ def test_training_has_a_larger_stopping_margin_and_a_parking_bonus_and_the_predi
         monkeypatch.setattr(module, "ModelEnv", CountedEnv)
     (tmp_path / "models").mkdir()
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
+    train(TrainingRequest(plan, tmp_path / "models", [], ENVELOPE), lambda *what: None)
     edge_m = max(x for x, _ in ENVELOPE.arena_m)
     history = np.zeros((HISTORY, 2))
     training_env, evaluation_env, prediction_env, _drawn_cars = envs
@@ -209,7 +213,7 @@ def test_training_accepts_an_episode_without_a_tick(tmp_path: Path) -> None:
     run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
     assert len(run.recordings()) == 1
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    assert train(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)["rows"] == 0
+    assert train(TrainingRequest(plan, run.models, run.recordings(), ENVELOPE), lambda *what: None)["rows"] == 0
 
 
 @pytest.mark.parametrize(
@@ -224,7 +228,7 @@ def test_error_in_the_training_process_is_reported_in_one_sentence(
         run.episode_path(1).write_bytes(recording)
     plan = tiny_plan(choose_car("sim"), model_steps=1, **changes)
     with pytest.raises(DataError, match=message) as error:
-        train_in_subprocess(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)
+        train_in_subprocess(TrainingRequest(plan, run.models, run.recordings(), ENVELOPE), lambda *what: None)
     assert "\n" not in str(error.value)
     assert names(run) == ([] if recording is None else ["episodes/0001.mcap"])
     assert multiprocessing.active_children() == []
@@ -251,5 +255,5 @@ def test_death_of_the_training_process_names_the_next_command(
     monkeypatch.setattr("carlab.experiment.campaign.training_process.run_in_child", die)
     plan = tiny_plan(choose_car("sim"))
     with pytest.raises(TrainingDiedError) as error:
-        train_in_subprocess(plan, tmp_path, recordings, ENVELOPE, lambda *what: None)
+        train_in_subprocess(TrainingRequest(plan, tmp_path, recordings, ENVELOPE), lambda *what: None)
     assert str(error.value) == expected

@@ -38,7 +38,7 @@ from carlab.experiment.campaign.prior_correction_process import (
     run_correction_subprocess,
 )
 from carlab.experiment.campaign.quick_check import check_path, run_check_subprocess
-from carlab.experiment.campaign.training import model_folder, training_figures
+from carlab.experiment.campaign.training import TrainingRequest, model_folder, training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
 from carlab.experiment.episodes.result import EpisodeResult
@@ -152,14 +152,9 @@ class Campaign:
             if not folder.is_dir():
                 if not self._correct_prior():
                     return
-                trained = (self.trainer or train_in_subprocess)(
-                    self.current_plan(done),
-                    self.run.models,
-                    self.run.recordings(),
-                    self._envelope,
-                    self.hooks.on_training,
-                    self.stop,
-                )
+                plan = self.current_plan(done)
+                request = TrainingRequest(plan, self.run.models, self.run.recordings(), self._envelope)
+                trained = (self.trainer or train_in_subprocess)(request, self.hooks.on_training, self.stop)
                 if trained is None:
                     return
                 self.hooks.on_learned(trained)

@@ -10,7 +10,7 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,16 +93,38 @@ def model_folder(models: Path, episode: int) -> Path:
     return models / f"{episode:04d}"
 
 
-def train(
-    plan: TrainingPlan, models: Path, recordings: list[Path], envelope: SafetyEnvelope, progress: Progress
-) -> dict[str, Any]:
-    """Fit the car and train the policy before the episode that follows the recordings.
+@dataclass(frozen=True, slots=True)
+class TrainingRequest:
+    """A training before the episode that follows the recordings.
 
-    Args:
+    Attributes:
         plan: settings of the run.
-        models: folder that receives the result.
+        models: folder of the models, which receives the result.
         recordings: MCAP files of all episodes so far, in order.
         envelope: limits of the car's safety gate.
+    """
+
+    plan: TrainingPlan
+    models: Path
+    recordings: Sequence[Path]
+    envelope: SafetyEnvelope
+
+    @property
+    def number(self) -> int:
+        """Number of the episode after the training."""
+        return len(self.recordings) + 1
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the result."""
+        return model_folder(self.models, self.number)
+
+
+def train(request: TrainingRequest, progress: Progress) -> dict[str, Any]:
+    """Fit the car and train the policy.
+
+    Args:
+        request: settings and recordings.
         progress: called with the name of the stage, the steps done and the number of steps.
 
     Returns:
@@ -113,11 +135,11 @@ def train(
             cannot be written.
         DivergedError: model or policy diverged twice.
     """
+    plan, number = request.plan, request.number
     torch.set_num_threads(plan.threads)
-    number = len(recordings) + 1
     progress("reading the recordings", 0, 1)
-    usable, newest = _usable_episodes(recordings, plan.history)
-    earlier = model_folder(models, number - 1)
+    usable, newest = _usable_episodes(request.recordings, plan.history)
+    earlier = model_folder(request.models, number - 1)
     earlier_car = load_car(earlier / DYNAMICS_FILE, plan.device) if earlier.is_dir() else None
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
@@ -127,7 +149,7 @@ def train(
 
     clock = MonotonicClock()
     began_s = clock.now_s()
-    if len(recordings) == EPISODES_BEFORE_HISTORY_CHOICE:
+    if number - 1 == EPISODES_BEFORE_HISTORY_CHOICE:
         figures |= _history_figures(usable, progress)
     seed = plan.seed + 1000 * number
     same_inputs = earlier_car if earlier_car is not None and earlier_car.history == plan.history else None
@@ -135,23 +157,23 @@ def train(
     figures["model_seconds"] = clock.now_s() - began_s
 
     began_s = clock.now_s()
-    environments = _environments(plan, dynamics, usable, envelope, seed)
+    environments = _environments(plan, dynamics, usable, request.envelope, seed)
     agent, policy_figures = _trained_policy(
         plan, *environments, None if earlier_car is None else earlier, plan.updates_before(number), progress
     )
     figures |= {**policy_figures, "policy_seconds": clock.now_s() - began_s}
-    figures |= _predicted_figures(plan, agent, dynamics, usable, envelope, seed)
+    figures |= _predicted_figures(plan, agent, dynamics, usable, request.envelope, seed)
 
     def write(folder: Path) -> None:
         save_car(dynamics, folder / DYNAMICS_FILE)
         agent.save(folder)
         (folder / PRIOR_FILE).write_text(plan.prior_toml, encoding="utf-8")
 
-    _publish(model_folder(models, number), figures, write)
+    _publish(request.folder, figures, write)
     return figures
 
 
-def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[EpisodeData], EpisodeData | None]:
+def _usable_episodes(recordings: Sequence[Path], history: int) -> tuple[list[EpisodeData], EpisodeData | None]:
     """Recorded episodes with at least one complete transition, and the newest recording if it is one of them."""
     episodes = [read_episode(path) if has_ticks(path) else None for path in recordings]
     usable = [e for e in episodes if e is not None and has_whole_step(e, history)]

@@ -4,51 +4,28 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from carlab.core.errors import DataError
-from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign.child_process import ChildError, run_in_child
-from carlab.experiment.campaign.training import Progress, train
-from carlab.experiment.campaign.training_plan import TrainingPlan
+from carlab.experiment.campaign.training import Progress, TrainingRequest, train
 
 
 class TrainingDiedError(DataError):
     """The process of a training died."""
 
 
-class Trainer(Protocol):
-    """Trains like ``train_in_subprocess``, here or elsewhere; a car may be open meanwhile, and stays in neutral."""
-
-    def __call__(
-        self,
-        plan: TrainingPlan,
-        models: Path,
-        recordings: list[Path],
-        envelope: SafetyEnvelope,
-        progress: Progress,
-        stop: Callable[[], bool],
-    ) -> dict[str, Any] | None:
-        """Arguments, result and errors of ``train_in_subprocess``."""
-        ...
+Trainer = Callable[[TrainingRequest, Progress, Callable[[], bool]], dict[str, Any] | None]
+"""Trains like ``train_in_subprocess``, here or elsewhere; a car may be open meanwhile, and stays in neutral."""
 
 
 def train_in_subprocess(
-    plan: TrainingPlan,
-    models: Path,
-    recordings: list[Path],
-    envelope: SafetyEnvelope,
-    progress: Progress,
-    stop: Callable[[], bool] = lambda: False,
+    request: TrainingRequest, progress: Progress, stop: Callable[[], bool] = lambda: False
 ) -> dict[str, Any] | None:
     """Run ``train`` in another process and wait for it.
 
     Args:
-        plan: as for ``train``.
-        models: as for ``train``.
-        recordings: as for ``train``.
-        envelope: as for ``train``.
+        request: as for ``train``.
         progress: as for ``train``.
         stop: polled; once true, the process is terminated and its partial result removed.
 
@@ -60,19 +37,17 @@ def train_in_subprocess(
         TrainingDiedError: its process died.
     """
     try:
-        figures: dict[str, Any] | None = run_in_child(
-            "training", train, (plan, models, recordings, envelope), stop, on_report=progress
-        )
+        figures: dict[str, Any] | None = run_in_child("training", train, (request,), stop, on_report=progress)
     except ChildError as error:
-        recorded = "; the recordings remain" if recordings else ""
+        recorded = "; the recordings remain" if request.recordings else ""
         if error.end == "died":
-            remedy = "Resume the run with --resume." if recordings else "Start the run again."
+            remedy = "Resume the run with --resume." if request.recordings else "Start the run again."
             raise TrainingDiedError(
                 f"The training process died ({error}; -9 often means too little memory){recorded}. {remedy}"
             ) from None
         crash = f"Training failed: {error}{recorded}."
         raise DataError(str(error) if error.end == "failed" else crash) from None
     finally:
-        for unfinished in models.glob("*.partial"):
+        for unfinished in request.models.glob("*.partial"):
             shutil.rmtree(unfinished, ignore_errors=True)
     return figures

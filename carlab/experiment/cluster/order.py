@@ -18,7 +18,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from carlab.core.json_files import read_json
 from carlab.core.observation import feature_size
 from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign.figures_file import FIGURES_FILE, read_training_figures
-from carlab.experiment.campaign.training import DYNAMICS_FILE, PRIOR_FILE, model_folder
+from carlab.experiment.campaign.training import DYNAMICS_FILE, PRIOR_FILE, TrainingRequest, model_folder
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
 from learning.world.car_fit import load_car, load_car_arrays, save_car, save_car_arrays
@@ -39,31 +39,8 @@ RESULT_FILES = frozenset({ARRAYS_FILE, AGENT_FILE, FIGURES_FILE})
 """Files of a result as the cluster sends them."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingOrder:
-    """The arguments of ``train``.
-
-    Attributes:
-        plan: settings of the run.
-        models: folder of the models.
-        recordings: MCAP files of all episodes so far.
-        envelope: limits of the car's safety gate.
-    """
-
-    plan: TrainingPlan
-    models: Path
-    recordings: tuple[Path, ...]
-    envelope: SafetyEnvelope
-
-    @property
-    def number(self) -> int:
-        """Number of the episode after the training."""
-        return len(self.recordings) + 1
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the result."""
-        return model_folder(self.models, self.number)
+class TrainingOrder(TrainingRequest):
+    """A training as files."""
 
     def files(self) -> dict[str, bytes]:
         """The order as files, by relative path.

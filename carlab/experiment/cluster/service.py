@@ -143,10 +143,7 @@ class TrainingService:
             try:
                 write_files(Path(fresh), files)
                 order = TrainingOrder.read(Path(fresh))
-                train_in_subprocess(
-                    order.plan, order.models, list(order.recordings), order.envelope, on_progress,
-                    training.stopped.is_set,
-                )  # fmt: skip
+                train_in_subprocess(order, on_progress, training.stopped.is_set)
                 if not training.stopped.is_set():
                     training.result = order.result()
                     training.state = "done"

@@ -12,8 +12,7 @@ from typing import Any
 
 from carlab.core.clock import Clock, MonotonicClock
 from carlab.core.errors import ConfigError, DataError
-from carlab.core.safety import SafetyEnvelope
-from carlab.experiment.campaign.training import Progress
+from carlab.experiment.campaign.training import Progress, TrainingRequest
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
 from carlab.experiment.cluster.link_process import Link
@@ -90,13 +89,7 @@ class ClusterTrainer:
         self.link.close()
 
     def __call__(
-        self,
-        plan: TrainingPlan,
-        models: Path,
-        recordings: list[Path],
-        envelope: SafetyEnvelope,
-        progress: Progress,
-        stop: Callable[[], bool] = lambda: False,
+        self, request: TrainingRequest, progress: Progress, stop: Callable[[], bool] = lambda: False
     ) -> dict[str, Any] | None:
         """Train on the cluster, or on this computer if the cluster does not answer; as ``train_in_subprocess``.
 
@@ -104,7 +97,7 @@ class ClusterTrainer:
             ConfigError: the task is an object of a Python program, which cannot be sent as data.
             DataError: the training failed, or its files cannot be read or written.
         """
-        order = TrainingOrder(plan, models, tuple(recordings), envelope)
+        order = TrainingOrder(request.plan, request.models, request.recordings, request.envelope)
         arrived = order.folder.with_name(f"{order.folder.name}.partial")
         shutil.rmtree(arrived, ignore_errors=True)
         try:
@@ -113,7 +106,7 @@ class ClusterTrainer:
                 waiting = _Waiting(self, LinkRequest(folder, str(arrived)), order.number, progress)
                 return self._published(order, arrived) if waiting.until_done(stop) else None
         except OSError as error:
-            raise DataError(describe_os_error(error, models)) from error
+            raise DataError(describe_os_error(error, request.models)) from error
         except _RunHereError as error:
             reason = str(error)
         finally:
@@ -121,7 +114,7 @@ class ClusterTrainer:
         self.link.cut()
         self.is_lost = True
         self.say(f"{reason}; the training before episode {order.number} runs on this computer.")
-        return self.train_here(_plan_here(plan), models, recordings, envelope, progress, stop)
+        return self.train_here(replace(request, plan=_plan_here(request.plan)), progress, stop)
 
     def _published(self, order: TrainingOrder, arrived: Path) -> dict[str, Any]:
         try:
