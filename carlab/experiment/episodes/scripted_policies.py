@@ -14,35 +14,36 @@ from carlab.core.quantities import NEUTRAL, Action, FloatArray
 from sim_backends.car_parameters import SimulatorConfig
 
 
-class NeutralPolicy:
+class StatelessPolicy:
+    """A policy without a state."""
+
+    def reset(self) -> None:
+        """Do nothing."""
+
+
+class NeutralPolicy(StatelessPolicy):
     """Neutral at every tick."""
 
     name = "neutral"
-
-    def reset(self) -> None:
-        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """Neutral steering and throttle."""
         return NEUTRAL
 
 
-class ManoeuvrePolicy:
+class ManoeuvrePolicy(StatelessPolicy):
     """A manoeuvre as a function of time."""
 
     def __init__(self, manoeuvre: Manoeuvre) -> None:
         self.name = manoeuvre.name
         self._manoeuvre = manoeuvre
 
-    def reset(self) -> None:
-        """Do nothing: the policy has no state."""
-
     def act(self, view: PolicyInput) -> Action | None:
         """Action of the manoeuvre at this time."""
         return self._manoeuvre.command(view.elapsed_s + 1e-9)
 
 
-class ReplayPolicy:
+class ReplayPolicy(StatelessPolicy):
     """Replays recorded actions (T, 2) at their times [s] (T,) since the first, each held until the next."""
 
     name = "replay"
@@ -51,9 +52,6 @@ class ReplayPolicy:
         self._times_s = np.asarray(times_s, dtype=np.float64) - times_s[0]
         self._actions = actions
         self._end_s = float(self._times_s[-1] + (np.median(np.diff(self._times_s)) if len(times_s) > 1 else 0.0))
-
-    def reset(self) -> None:
-        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """The action held at this time, with a tolerance of 1 ms for an early tick."""
@@ -64,7 +62,7 @@ class ReplayPolicy:
 
 
 @dataclass(slots=True)
-class ReverseParkingPolicy:
+class ReverseParkingPolicy(StatelessPolicy):
     """Reverse parking by feedback: a baseline for learned policies.
 
     The car drives in reverse. A vector field determines its course (Nelson et al., "Vector field path following for
@@ -101,9 +99,6 @@ class ReverseParkingPolicy:
             mass_kg=p.mass_kg,
             reaction_s=simulator.command_delay_s + 0.04,
         )
-
-    def reset(self) -> None:
-        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """Steering and throttle of this tick."""
