@@ -113,10 +113,12 @@ def _extra_columns(
     return kept
 
 
-def _started_texts(started: EpisodeStarted) -> dict[str, str]:
+def facts_of(started: EpisodeStarted) -> dict[str, str]:
+    """Texts of an EpisodeStarted by name, without its configuration and metadata; numbers are exact."""
     return {
-        **started.metadata,
         "episode": str(started.episode),
+        "start_t_s": repr(started.t_s),
+        "start_wall_ns": str(started.wall_ns),
         "car": started.car,
         "reality": started.reality.value,
         "policy": started.policy,
@@ -127,10 +129,11 @@ def _started_texts(started: EpisodeStarted) -> dict[str, str]:
         "goal": json.dumps(started.goal),
         "arena_m": json.dumps(started.arena_m),
         "path_m": json.dumps(started.path_m),
-        "start_t_s": repr(started.t_s),
-        "start_wall_ns": str(started.wall_ns),
-        "config_toml": started.config_toml,
     }
+
+
+def _started_texts(started: EpisodeStarted) -> dict[str, str]:
+    return {**started.metadata, **facts_of(started), "config_toml": started.config_toml}
 
 
 def _ended_texts(ended: EpisodeEnded | None) -> dict[str, str]:

@@ -17,6 +17,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from carlab.core.documents import EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, CarState, Health, Observation, PoseSample, Reality
+from carlab.recording.episode_builder import facts_of
 from carlab.recording.mcap import schemas as schemas
 from carlab.recording.sink import Item, LogLine
 
@@ -187,22 +188,8 @@ def _log(line: LogLine, t_s: float) -> Stamped:
 
 def started_to_metadata(started: EpisodeStarted) -> dict[str, str]:
     """Everything of an EpisodeStarted except the configuration, which is an attachment; numbers are exact."""
-    return {
-        "episode": str(started.episode),
-        "start_t_s": repr(started.t_s),
-        "start_wall_ns": str(started.wall_ns),
-        "car": text(started.car),
-        "reality": started.reality.value,
-        "policy": text(started.policy),
-        "task": text(started.task),
-        "seed": str(started.seed),
-        "period_s": repr(started.period_s),
-        "history_length": str(started.history_length),
-        "goal": json.dumps(started.goal),
-        "arena_m": json.dumps(started.arena_m),
-        "path_m": json.dumps(started.path_m),
-        **{f"metadata.{text(key)}": text(value) for key, value in started.metadata.items()},
-    }
+    facts = {**facts_of(started), **{f"metadata.{key}": value for key, value in started.metadata.items()}}
+    return {text(key): text(value) for key, value in facts.items()}
 
 
 def ended_to_metadata(ended: EpisodeEnded) -> dict[str, str]:
