@@ -5,9 +5,9 @@ list it here.
 
 Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity,
 offset) and throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
-asymmetry, saturation) -> driven axle (traction limit, wheel slip) -> body (resistances, slope, bias, moments) -> load
-transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is measured (marker offset, yaw misalignment,
-velocity filter, latency). Within a group: by ``order``, then by id.
+asymmetry, drag brake, saturation) -> driven axle (speed controller, traction limit, wheel slip) -> body (resistances,
+slope, bias, moments) -> load transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is measured (marker
+offset, yaw misalignment, velocity filter, latency). Within a group: by ``order``, then by id.
 """
 
 from __future__ import annotations
@@ -29,7 +29,14 @@ from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDa
 from sim_backends.effects.curves import CURVES, MeasuredCurve
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
 from sim_backends.effects.disturbances import BODY_FORCE_PARAMETERS, DISTURBANCES, DRIFTING_PARAMETERS, Disturbance
-from sim_backends.effects.drive import BatterySag, BrakeAsymmetry, MotorSaturation, TractionLimit
+from sim_backends.effects.drive import (
+    BatterySag,
+    BrakeAsymmetry,
+    DragBrake,
+    MotorSaturation,
+    SpeedController,
+    TractionLimit,
+)
 from sim_backends.effects.lags import MotorLag, SteeringLag
 from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
 from sim_backends.effects.observations import MarkerOffset, MocapLatency, MocapYawMisalignment, VelocityFilterLag
@@ -69,6 +76,8 @@ _ALL: tuple[Effect, ...] = (
     MotorLag(),
     MotorSaturation(),
     TractionLimit(),
+    SpeedController(),
+    DragBrake(),
     BrakeAsymmetry(),
     BatterySag(),
     RollingResistance(),

@@ -1,16 +1,33 @@
-"""Motor force and force limit of the driven axle. Acting order: sag, brake asymmetry, saturation, traction."""
+"""Motor force and force limit of the driven axle.
+
+Acting order: sag, brake asymmetry, drag brake, saturation, speed controller, traction.
+"""
 
 from __future__ import annotations
 
 import math
 
+from carlab.core.quantities import FloatArray
 from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
+from sim_backends.effects.base import (
+    Confusable,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    Parameters,
+    ScreeningProbe,
+)
+from sim_backends.effects.resistances import ROLLING_SPEED_MPS
 
 MAX_FORCE_N = 1e9
 MAX_SHARE = 1e6
 TINY = 1e-12
 """Keeps a root differentiable and a quotient finite."""
+RELEASED_THROTTLE = 0.05
+"""Throttle at which a drag brake ends [1]."""
+SCREENING_RATIOS = (0.15, 0.25, 0.4, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0)
+"""Sizes of the forces of a screened speed controller, over typical ones."""
+SCREENING_ROUNDNESS = 0.1
 
 
 class BatterySag(DynamicsEffect):
@@ -57,6 +74,54 @@ class BrakeAsymmetry(DynamicsEffect):
         forces.drive = ops.where(braking, forces.drive * values["gain_ratio"], forces.drive)
 
 
+def drag_brake_share(ops: Ops, throttle: Value, vx: Value, width: Value) -> Value:
+    """Force (cars,) of a drag brake along x, over its largest force: ``-max(1 - |u| / width, 0) tanh(vx / 0.05 m/s)``.
+
+    Args:
+        ops: Functions of the array library.
+        throttle: [1].
+        vx: Speed [m/s].
+        width: Throttle at which the brake ends [1].
+    """
+    released = ops.at_least(1.0 - ops.abs(throttle) / width, 0.0)
+    return -released * ops.tanh(vx * (1.0 / ROLLING_SPEED_MPS))
+
+
+class DragBrake(DynamicsEffect):
+    """``F_x -= force max(1 - |u| / 0.05, 0) tanh(vx / 0.05 m/s)``: the motor brakes while the throttle is released.
+
+    Motor controllers of RC cars have such a brake as a setting. It is a part of the motor's force, so a limit of that
+    force includes it.
+    """
+
+    id = "drag_brake"
+    represented_by = "drive_map"
+    command = "throttle"
+    name = "a drag brake with the throttle released"
+    summary = "The motor brakes while the throttle is released."
+    sentence = "the motor brakes with {force} while the throttle is released"
+    refuted_if = "the car slows down as much with a little throttle as with none (then it is a resistance)"
+    order = 27
+    parameters = (EffectParameter("force", "N", 0.0, 0.0, 50.0, 2.0),)
+    confusable = (
+        Confusable(
+            "rolling_resistance",
+            "throttle_ramp",
+            "a drag brake ends with the first throttle, while a resistance slows the car at any throttle",
+        ),
+        Confusable(
+            "throttle_deadband",
+            "coast_down",
+            "without throttle a dead band has no effect, while a drag brake stops the car",
+        ),
+    )
+
+    def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Brake."""
+        share = drag_brake_share(ops, forces.throttle, forces.vx, RELEASED_THROTTLE)
+        forces.drive = ops.fma(values["force"], share, forces.drive)
+
+
 def limited_force(ops: Ops, force: Value, limit: Value, roundness: Value) -> Value:
     """Limit a force (cars,) [N]: ``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for its size a, with limit b.
 
@@ -98,6 +163,66 @@ class MotorSaturation(DynamicsEffect):
         """Limit the force."""
         limit = ops.where(values["force"] < MAX_FORCE_N, values["force"], MAX_FORCE_N)
         forces.drive = limited_force(ops, forces.drive, limit, values["roundness"])
+
+
+def limited_by_direction(ops: Ops, force: Value, forward: Value, backward: Value, roundness: Value) -> Value:
+    """Limit a force (cars,) [N] to ``forward`` where it is positive, and to ``backward`` [N] where it is negative."""
+    return limited_force(ops, force, ops.where(force < 0.0, backward, forward), roundness)
+
+
+class SpeedController(DynamicsEffect):
+    """``F_x = L(drive_gain u - damping vx)``: a controller that holds the speed ``u drive_gain / damping``.
+
+    Its gain is ``damping``. L limits its force to ``forward_force`` and, in the other direction, to ``backward_force``:
+    ``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for the size a of a force with the limit b, without
+    roundness the smaller of both.
+    """
+
+    id = "speed_controller"
+    represented_by = "drive_map"
+    command = "throttle"
+    name = "a controller that holds a speed, with limited force"
+    summary = "The motor controller holds the speed that the throttle demands, with limited force."
+    sentence = (
+        "the motor controller holds a speed, with a force of at most {forward_force} forwards and {backward_force} "
+        "backwards, with roundness {roundness} (0: sharp limits)"
+    )
+    refuted_if = "without throttle, a faster car slows down more (then the braking force has no limit)"
+    order = 35
+    parameters = (
+        EffectParameter("forward_force", "N", math.inf, 0.0, math.inf, 3.0),
+        EffectParameter("backward_force", "N", math.inf, 0.0, math.inf, 2.5),
+        EffectParameter("roundness", "1", 0.0, 0.0, 1.0, 0.3),
+    )
+    confusable = (
+        Confusable(
+            "motor_saturation",
+            "coast_down",
+            "a controller with limited force brakes a fast car no more than a slow one; damping brakes it more",
+        ),
+        Confusable(
+            "traction_limit",
+            "throttle_ramp",
+            "a limit of traction falls in turns, which need grip; that of a motor controller does not",
+        ),
+    )
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Limits of equal and of different size in both directions, slightly round."""
+        forward, backward, _ = (p.typical for p in self.parameters)
+        return probe.points(
+            {"forward_force": forward * ahead, "backward_force": backward * back, "roundness": SCREENING_ROUNDNESS}
+            for ratio in SCREENING_RATIOS
+            for ahead, back in ((ratio, ratio), (ratio, 0.7 * ratio), (0.7 * ratio, ratio))
+        )
+
+    def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Limit the motor's force, damping included."""
+        forward, backward = (
+            ops.where(values[name] < MAX_FORCE_N, values[name], MAX_FORCE_N)
+            for name in ("forward_force", "backward_force")
+        )
+        forces.axle_force = limited_by_direction(ops, forces.axle_force, forward, backward, values["roundness"])
 
 
 class TractionLimit(DynamicsEffect):

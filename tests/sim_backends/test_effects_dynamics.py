@@ -77,6 +77,17 @@ CASES = {
     },
     "transfer_with_downforce": {"load_transfer": {"height": 0.1}, "aerodynamic_downforce": {"coefficient": 0.5}},
     "traction_with_transfer": {"traction_limit": {"share": 0.6}, "load_transfer": {"height": 0.06}},
+    "limits_of_both_directions": {"speed_controller": {"forward_force": 1.2, "backward_force": 2.5}},
+    "round_controller_with_traction_and_transfer": {
+        "speed_controller": {"forward_force": 1.5, "backward_force": 3.0, "roundness": 0.3},
+        "traction_limit": {"share": 0.5},
+        "load_transfer": {"height": 0.06},
+    },
+    "saturated_drag_brake": {"drag_brake": {"force": 4.0}, "motor_saturation": {"force": 2.5}},
+    "controller_with_drag_brake": {
+        "drag_brake": {"force": 4.0},
+        "speed_controller": {"forward_force": 1.2, "backward_force": 2.5},
+    },
     "round_traction_with_transfer": {
         "traction_limit": {"share": 0.7, "roundness": 0.4},
         "load_transfer": {"height": 0.06},
@@ -135,12 +146,18 @@ def reference_rates(t, s, d, u, p, e):
         drive *= e["brake_asymmetry"]["gain_ratio"]
     if has("drive_map"):
         drive += m * drive_map_at(e, u, vx)
+    if has("drag_brake"):
+        drive -= e["drag_brake"]["force"] * max(1 - abs(u) / 0.05, 0) * math.tanh(vx / 0.05)
     if has("motor_saturation"):
         limit, shape = e["motor_saturation"]["force"], 1 - e["motor_saturation"].get("roundness", 0)
         drive = math.copysign(smaller_root(shape, abs(drive), limit), drive)
     if has("drive_change"):
         drive *= 1 + e["drive_change"]["share"]
     demand = drive - p.damping_nspm * vx
+    if has("speed_controller"):
+        q = e["speed_controller"]
+        limit, shape = q["forward_force" if demand > 0 else "backward_force"], 1 - q.get("roundness", 0)
+        demand = math.copysign(smaller_root(shape, abs(demand), limit), demand)
 
     body_x = body_y = moment = 0.0
     if has("rolling_resistance"):

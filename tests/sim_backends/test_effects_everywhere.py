@@ -33,6 +33,8 @@ IDS = [
     "motor_lag",
     "motor_saturation",
     "traction_limit",
+    "speed_controller",
+    "drag_brake",
     "brake_asymmetry",
     "battery_sag",
     "rolling_resistance",
@@ -186,7 +188,7 @@ def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
     if name == "low_friction_patch":  # on its rim, where the position matters
         x, y = float(start[0, 0]), float(start[0, 1])
         numbers |= {f"effects.{name}.x": x - 0.5, f"effects.{name}.y": y - 0.4, f"effects.{name}.radius": 0.65}
-    if name == "coast_brake":
+    if name in ("coast_brake", "drag_brake"):
         commands[:, 2:, 1] *= 0.05
 
     def losses(values):

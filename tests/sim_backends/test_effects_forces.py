@@ -68,6 +68,41 @@ def test_motor_saturation_and_traction_limit_bound_the_acceleration():
             assert state.vx_mps == pytest.approx(sign * force / P.mass_kg, rel=1e-9)
 
 
+def test_speed_controller_drives_and_brakes_with_limited_force_and_holds_its_speed():
+    """Far from its speed v_u = u gain / damping the force is constant; near v_u the error of the speed decays."""
+    numbers = {"motor__damping": 6.0, "motor__drive_gain": 18.0}
+    cfg = config({"speed_controller": {"forward_force": 3.0, "backward_force": 5.0}}, **numbers)
+    for start, throttle, force in ((0.0, 1.0, 3.0), (4.0, 0.0, -5.0), (0.0, -1.0, -5.0), (-4.0, 0.0, 3.0)):
+        state = drive(cfg, (0, 0, 0, start, 0, 0), (0.0, throttle), 0.2).state
+        assert state.vx_mps == pytest.approx(start + 0.2 * force / P.mass_kg, rel=1e-9)
+    near = drive(cfg, (0, 0, 0, 1.2, 0, 0), (0.0, 0.5), 0.4).state
+    assert near.vx_mps == pytest.approx(1.5 - 0.3 * math.exp(-6.0 / P.mass_kg * 0.4), rel=1e-6)
+
+
+def test_round_controller_has_the_harmonic_limit_at_roundness_one():
+    effects = {"speed_controller": {"forward_force": P.drive_gain_n, "backward_force": 2.0, "roundness": 1.0}}
+    forward = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, 1.0)).state
+    assert forward.vx_mps == pytest.approx(0.5 * P.drive_gain_n / P.mass_kg, rel=1e-9)
+    backward = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, -1.0)).state
+    force = 1.0 / (1.0 / P.drive_gain_n + 1.0 / 2.0)
+    assert backward.vx_mps == pytest.approx(-force / P.mass_kg, rel=1e-9)
+
+
+def test_drag_brake_stops_a_coasting_car_in_both_directions_and_ends_with_the_first_throttle():
+    """m dv/dt = -F tanh(v / v0), thus sinh(v / v0) = sinh(v_start / v0) exp(-F t / (m v0))."""
+    force, scale, duration_s = 2.0, 0.05, 0.3
+    cfg = config({"drag_brake": {"force": force}}, motor__damping=0.0)
+    for sign in (1.0, -1.0):
+        state = drive(cfg, (0, 0, 0, 0.5 * sign, 0, 0), duration_s=duration_s).state
+        left = math.sinh(0.5 / scale) * math.exp(-force * duration_s / P.mass_kg / scale)
+        assert state.vx_mps == pytest.approx(sign * scale * math.asinh(left), abs=1e-4)
+    for throttle in (0.05, -0.05):
+        plain = drive(config({}, motor__damping=0.0), (0, 0, 0, 2.0, 0, 0), (0.0, throttle)).state
+        assert drive(cfg, (0, 0, 0, 2.0, 0, 0), (0.0, throttle)).state.vx_mps == pytest.approx(plain.vx_mps, rel=1e-9)
+    half = drive(cfg, (0, 0, 0, 2.0, 0, 0), (0.0, 0.025)).state
+    assert half.vx_mps == pytest.approx(2.0 + (0.025 * P.drive_gain_n - 0.5 * force) / P.mass_kg, rel=1e-6)
+
+
 def test_round_saturation_is_the_harmonic_limit_at_roundness_one():
     """``1 / m = 1 / a + 1 / b``: at full throttle half of the force if the limit is the motor's gain."""
     effects = {"motor_saturation": {"force": P.drive_gain_n, "roundness": 1.0}}

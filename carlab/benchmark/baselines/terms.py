@@ -40,9 +40,11 @@ def library(data: Prepared) -> dict[str, Term]:
     terms |= {
         "rolling_resistance": _force(lambda s, v: (-np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
         "aerodynamic_drag": _force(lambda s, v: (-v[:, 3] * np.abs(v[:, 3]), 0.0, 0.0)),
+        "drag_brake": _force(lambda s, v: (-_released(s) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
+        "speed_controller": _force(lambda s, v: (_lost_force(s, v), 0.0, 0.0)),
         "cornering_drag": _force(lambda s, v: (-np.abs(_angle(s)) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
         "yaw_damping": _force(lambda s, v: (0.0, 0.0, -0.01 * v[:, 5])),
-        "torque_steer": _force(lambda s, v: (0.0, 0.0, 0.01 * s.commands()[:, :, 1].mean(axis=1))),
+        "torque_steer": _force(lambda s, v: (0.0, 0.0, 0.01 * _throttle(s))),
         "lateral_bias": _force(lambda s, v: (0.0, np.ones(len(v)), 0.0)),
         "road_slope:east": _force(lambda s, v: (-np.cos(v[:, 2]), np.sin(v[:, 2]), 0.0)),
         "road_slope:north": _force(lambda s, v: (-np.sin(v[:, 2]), -np.cos(v[:, 2]), 0.0)),
@@ -133,8 +135,24 @@ def _angle(s: Steps) -> FloatArray:
     return np.asarray(s.car.max_angle * s.commands()[:, :, 0].mean(axis=1))
 
 
+def _throttle(s: Steps) -> FloatArray:
+    return np.asarray(s.commands()[:, :, 1].mean(axis=1))
+
+
+def _released(s: Steps) -> FloatArray:
+    """1 without throttle, 0 from a twentieth of full throttle on."""
+    return np.asarray(np.maximum(1.0 - np.abs(_throttle(s)) / 0.05, 0.0))
+
+
+def _lost_force(s: Steps, middle: FloatArray) -> FloatArray:
+    """Change of the motor's force [N] by limits of 0.8 (forwards) and 0.6 (backwards) of its largest size."""
+    force = s.car.drive_gain * _throttle(s) - s.car.damping * middle[:, 3]
+    largest = float(np.quantile(np.abs(force), 0.99))
+    return np.asarray(np.clip(force, -0.6 * largest, 0.8 * largest) - force)
+
+
 def _combined(s: Steps, scale: float) -> FloatArray:
-    drive_n = s.car.drive_gain * s.commands()[:, :, 1].mean(axis=1)
+    drive_n = s.car.drive_gain * _throttle(s)
     share = np.clip(scale * drive_n / (s.car.mu_rear * s.car.load_rear), -0.9, 0.9)
     return np.asarray(np.sqrt(1.0 - share**2))
 

@@ -45,6 +45,20 @@ def soft_traction(now: Instant, p: Parameters, car: BaseCar) -> None:
     now.fx = top * math.tanh(now.fx / top)
 
 
+@hook("limit", first=True)
+def soft_controller(now: Instant, p: Parameters, car: BaseCar) -> None:
+    """A speed controller whose current approaches its limit gradually, in each direction."""
+    top = p["forward_force"] if now.fx > 0.0 else p["backward_force"]
+    now.fx = top * math.tanh(now.fx / top)
+
+
+@hook("drive")
+def shorted_motor(now: Instant, p: Parameters, car: BaseCar) -> None:
+    """A shorted motor: it brakes little at walking pace, and less and less with the first throttle."""
+    released = math.exp(-((now.u / 0.03) ** 2))
+    now.drive -= p["force"] * released * math.tanh(now.vx / 0.3)
+
+
 @hook("body")
 def stribeck(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Bearing friction that is larger at low speed."""
@@ -193,6 +207,12 @@ def friction_share(size: float, draw: Draw) -> dict[str, float]:
     return {"share": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(size, 1e-6)}
 
 
+def controller_forces(size: float, draw: Draw) -> dict[str, float]:
+    """Multiples of the largest drive force [N]: forwards, and 0.6 to 1 of it backwards."""
+    forward = draw.car.drive_gain / max(size, 1e-6)
+    return {"forward_force": forward, "backward_force": (0.6 + 0.4 * draw.shares[0]) * forward}
+
+
 def drag_parameters(size: float, draw: Draw) -> dict[str, float]:
     """Coefficient, and an exponent from 1.8 to 2.2."""
     return {"coefficient": size, "exponent": 1.8 + 0.4 * draw.shares[0]}
@@ -201,6 +221,8 @@ def drag_parameters(size: float, draw: Draw) -> dict[str, float]:
 FORMS = (
     Form("motor_saturation", "other", force_limit, soft_motor, 0.3, 3.0),
     Form("traction_limit", "other", friction_share, soft_traction, 0.3, 3.0, fixed={"axle": "rear"}),
+    Form("speed_controller", "other", controller_forces, soft_controller, 0.3, 3.0),
+    Form("drag_brake", "other", plain("force"), shorted_motor, 0.3, 20.0),
     Form("battery_sag", "other", plain("rate"), charge_sag, 0.0004, 0.008),
     Form("brake_asymmetry", "other", factor("gain_ratio"), soft_brake, 0.1, 1.5),
     Form("rolling_resistance", "other", plain("force"), stribeck, 0.05, 2.0),

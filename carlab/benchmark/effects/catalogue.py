@@ -55,6 +55,8 @@ CONFUSABLE: dict[str, tuple[str, ...]] = {
     "marker_offset": (),
     "mocap_yaw_misalignment": ("steering_offset",),
     "velocity_filter_lag": ("motor_lag", "steering_lag"),
+    "speed_controller": ("motor_saturation", "traction_limit"),
+    "drag_brake": ("rolling_resistance", "throttle_deadband"),
 }
 EFFECT_IDS = tuple(CONFUSABLE)
 LAG_PARAMETERS = {

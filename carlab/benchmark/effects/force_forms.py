@@ -26,6 +26,13 @@ def brake_asymmetry(now: Instant, p: Parameters, car: BaseCar) -> None:
 
 
 @hook("drive")
+def drag_brake(now: Instant, p: Parameters, car: BaseCar) -> None:
+    """A constant braking force where the throttle is released; it ends at a twentieth of full throttle."""
+    released = max(1.0 - 20.0 * abs(now.u), 0.0)
+    now.drive -= p["force"] * released * math.tanh(now.vx / STICTION_MPS)
+
+
+@hook("drive")
 def battery_sag(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Drive gain falls with time since the first row."""
     now.drive *= 1.0 - p["rate"] * now.t
@@ -37,6 +44,12 @@ def traction_limit(now: Instant, p: Parameters, car: BaseCar) -> None:
     share = p["share"]
     top = now.mu_r * now.fz_r
     now.fx = min(max(now.fx, -share * top), share * top)
+
+
+@hook("limit", first=True)
+def speed_controller(now: Instant, p: Parameters, car: BaseCar) -> None:
+    """The controller's force, in proportion to the error of the speed, between two bounds."""
+    now.fx = min(max(now.fx, -p["backward_force"]), p["forward_force"])
 
 
 @hook("body")
@@ -93,9 +106,17 @@ def friction_share(size: float, draw: Draw) -> dict[str, float]:
     return {"share": (2.0 * draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear)) * math.exp(-size)}
 
 
+def controller_forces(size: float, draw: Draw) -> dict[str, float]:
+    """Shares of twice the largest drive force [N]: forwards, and 0.6 to 1 of it backwards."""
+    forward = 2.0 * draw.car.drive_gain * math.exp(-size)
+    return {"forward_force": forward, "backward_force": (0.6 + 0.4 * draw.shares[0]) * forward}
+
+
 FORMS = (
     Form("motor_saturation", "catalogue", force_limit, motor_saturation, 0.7, 3.0),
     Form("traction_limit", "catalogue", friction_share, traction_limit, 1.2, 3.5, fixed={"axle": "rear"}),
+    Form("speed_controller", "catalogue", controller_forces, speed_controller, 1.2, 3.5),
+    Form("drag_brake", "catalogue", plain("force"), drag_brake, 0.3, 20.0),
     Form("brake_asymmetry", "catalogue", factor("gain_ratio"), brake_asymmetry, 0.1, 1.5),
     Form("battery_sag", "catalogue", plain("rate"), battery_sag, 0.0004, 0.008),
     Form("rolling_resistance", "catalogue", plain("force"), rolling_resistance, 0.05, 2.0),

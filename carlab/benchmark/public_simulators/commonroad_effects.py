@@ -49,6 +49,8 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "motor_lag": (Physics("similar", "no motor state; force follows torque through wheel inertia and slip"),),
     "motor_saturation": (Physics("similar", "commands stay below a_max = 11.5 m/s2; the rear tyres limit the force"),),
     "traction_limit": (Physics("yes", "F_x saturates at p_dx1 F_z of the driven rear wheels (tire_model.py)"),),
+    "speed_controller": (Physics("similar", "no controller; F_x of the rear wheels is limited in both directions"),),
+    "drag_brake": (Physics("no", "without throttle the requested acceleration is zero"),),
     "brake_asymmetry": (Physics("yes", "engine torque goes to the rear (T_se = 0), brake torque 66 % to the front"),),
     "battery_sag": (Physics("no", "nothing depends on time"),),
     "rolling_resistance": (_NO_DRAG,),

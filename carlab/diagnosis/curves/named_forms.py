@@ -14,13 +14,22 @@ from typing import Any
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from sim_backends.array_ops import ARRAYS
 from sim_backends.effects.curves import DriveMap, FrontTyreMap, RearTyreMap, SteeringCurve
-from sim_backends.effects.drive import MotorSaturation
+from sim_backends.effects.drive import (
+    DragBrake,
+    MotorSaturation,
+    SpeedController,
+    drag_brake_share,
+    limited_by_direction,
+)
 from sim_backends.effects.steering import SteeringAsymmetry, SteeringDeadband, SteeringNonlinearity
 from sim_backends.effects.throttle import ThrottleDeadband, ThrottleNonlinearity
 
 SLOW_MPS = 0.1
-"""Speed below which dry friction and a drag brake fall to 0, so that a form is continuous."""
+"""Speed below which dry friction falls to 0, so that a form is continuous."""
+MIN_WIDTH = 1e-6
+"""Smallest throttle at which a drag brake ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,14 +86,14 @@ def _saturated_drive(
 
 
 def _drag_brake(gain: float, damping: float, width: float, brake: float, u: FloatArray, v: FloatArray) -> FloatArray:
-    released = np.maximum(1.0 - np.abs(u) / width, 0.0)
-    return np.asarray(gain * dead_band(u, width) - damping * v - brake * released * np.clip(v / SLOW_MPS, -1.0, 1.0))
+    share = drag_brake_share(ARRAYS, u, v, np.maximum(width, MIN_WIDTH))
+    return np.asarray(gain * dead_band(u, width) - damping * v + brake * share)
 
 
 def _speed_controller(
     speed: float, width: float, gain: float, brake: float, drive: float, u: FloatArray, v: FloatArray
 ) -> FloatArray:
-    return np.clip(gain * (speed * dead_band(u, width) - v), -brake, drive)
+    return np.asarray(limited_by_direction(ARRAYS, gain * (speed * dead_band(u, width) - v), drive, brake, 0.0))
 
 
 def _dc_motor(
@@ -116,9 +125,9 @@ DRIVE_FORMS = (
     Form(ThrottleNonlinearity.id, "an exponent of the throttle", (_GAIN, _EXPONENT, _DAMPING),
          lambda gain, exponent, damping, u, v: gain * power(u, exponent) - damping * v),
     Form(MotorSaturation.id, "a limit of the motor's force", (_GAIN, _BRAKE, _DRIVE, _DAMPING), _saturated_drive),
-    Form("drag_brake", "a drag brake with the throttle released",
+    Form(DragBrake.id, DragBrake.name,
          (_GAIN, _DAMPING, _WIDTH, FormParameter("brake", "m/s2", (2.0,))), _drag_brake),
-    Form("speed_controller", "a controller that holds a speed, with limited force",
+    Form(SpeedController.id, SpeedController.name,
          (FormParameter("speed at full throttle", "m/s", (3.0, 12.0)), _WIDTH,
           FormParameter("controller gain", "1/s", (2.0, 8.0)), _BRAKE, _DRIVE), _speed_controller),
     Form("dc_motor", "a DC motor, whose force falls with speed, with dead band and dry friction",
