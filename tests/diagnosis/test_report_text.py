@@ -125,7 +125,7 @@ def test_confusable_effects_are_symmetric() -> None:
     assert set(CONFUSABLE["steering_lag"]) == {
         *("steering_delay", "steering_rate_limit", "tyre_relaxation", "velocity_filter_lag"),
     }
-    assert set(CONFUSABLE["rolling_resistance"]) == {"throttle_deadband"}
+    assert set(CONFUSABLE["rolling_resistance"]) == {"throttle_deadband", "drag_brake"}
     assert CONFUSABLE["low_friction_patch"] == ()
 
 
