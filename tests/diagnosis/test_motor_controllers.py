@@ -2,19 +2,23 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from carlab.benchmark.cases.case import make_case
-from carlab.benchmark.world.measurement import write_csv
+from carlab.benchmark.effects.forms import all_forms
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.measurement import Noise, record
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import drive
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
-from carlab.recording.csv.foreign import import_csv
 from sim_backends.effects import confusable_effects
 
 pytestmark = pytest.mark.timeout(900)
+CAR = BaseCar()
 CANDIDATES = (
     "motor_saturation",
     "traction_limit",
@@ -23,25 +27,35 @@ CANDIDATES = (
     "rolling_resistance",
     "throttle_deadband",
 )
+CONCEALED = {
+    "speed_controller": {"forward_force": 0.5 * CAR.drive_gain, "backward_force": 0.3 * CAR.drive_gain},
+    "drag_brake": {"force": 0.3 * CAR.drive_gain},
+}
 
 
-def recorded(path: Path, columns: dict) -> EpisodeData:
-    write_csv(path, columns)
-    return import_csv(path).episodes[0]
+def recorded(effect: str, seed: int, duration_s: float) -> EpisodeData:
+    """A drive with steps of both commands: hard braking, reversing, and a released throttle in a third of them."""
+    rng = np.random.default_rng(seed)
+    ticks = round(duration_s / CAR.control_period)
+    steps = rng.uniform((-0.6, -1.0), (0.6, 1.0), (ticks // 10 + 2, 2))
+    steps[rng.random(len(steps)) < 1 / 3, 1] = 0.0
+    table = np.repeat(steps, 10, axis=0)
+    world = World(CAR)
+    all_forms()[effect, "catalogue"].attach(world, CONCEALED[effect])
+    driven = drive(world, lambda t, state: tuple(table[round(t / CAR.control_period)]), ticks * CAR.control_period)
+    measured = record(driven, world, Noise(0.0006, 0.002), rng)
+    sent = measured.commands[:-1]
+    return EpisodeData(measured.t_s, measured.measured, sent, sent, np.zeros(len(sent)))
 
 
-@pytest.mark.parametrize(("effect", "seed"), [("speed_controller", 61), ("drag_brake", 62)])
-def test_concealed_effect_of_the_motor_controller_is_named_with_its_numbers(
-    effect: str, seed: int, tmp_path: Path
-) -> None:
-    case = make_case("single", seed, effects=(effect,), excess=4.0, fit_s=60, hold_s=20)
-    case.nominal.write(tmp_path / "car.toml")
+@pytest.mark.parametrize("effect", CONCEALED)
+def test_concealed_effect_of_the_motor_controller_is_named_with_its_numbers(effect: str, tmp_path: Path) -> None:
+    CAR.write(tmp_path / "car.toml")
     nominal = load_car_file(tmp_path / "car.toml").simulator
-    fit, held_out = (recorded(tmp_path / f"{k}.csv", table) for k, table in enumerate((case.fit, case.hold)))
     texts = Texts(effect_sentence, separating_drive, confusable_effects())
+    fit, held_out = recorded(effect, 1, 30.0), recorded(effect, 2, 12.0)
     found = diagnose([fit], [held_out], nominal, texts, effects=CANDIDATES).diagnosis
     assert [e.id for e in found.effects] == [effect]
-    truth = case.answer()["effects"][0]["parameters"]
-    for name, value in truth.items():
+    for name, value in CONCEALED[effect].items():
         assert found.effects[0].parameters[name].value == pytest.approx(value, rel=0.1), name
     assert found.held_out["with_effects"].score < 0.5 * found.held_out["refit"].score
