@@ -54,10 +54,10 @@ def controller_acceleration(throttle, speed):
     return np.clip(GAIN * (TOP_SPEED * np.asarray(throttle) - np.asarray(speed)), -LIMIT, LIMIT)
 
 
-class SpeedController(DynamicsEffect):
+class HeldSpeed(DynamicsEffect):
     """``F_x = m clip(4 /s (3 m/s u - vx), -4 m/s2, 4 m/s2)``, with the strength 1."""
 
-    id = "speed_controller"
+    id = "held_speed"
     catalogued = False
     summary = "The motor controller holds a speed."
     class_statement = "holds a speed"
@@ -71,8 +71,8 @@ class SpeedController(DynamicsEffect):
 
 @pytest.fixture(scope="module")
 def drives():
-    with registered(SpeedController()):
-        config = replace(CAR, effects={"speed_controller": {"strength": 1.0}})
+    with registered(HeldSpeed()):
+        config = replace(CAR, effects={"held_speed": {"strength": 1.0}})
         return drive(config, 70.0, 1), drive(config, 25.0, 2)
 
 
