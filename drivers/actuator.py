@@ -26,6 +26,8 @@ START_TIMEOUT_S = 15.0
 ANSWER_TIMEOUT_S = 2.0
 SILENT_SENDER_S = 0.5
 POLL_S = 0.001
+RESUME_POLLS = 100
+"""Polls after a silence, before the sender counts as hanging: after a pause of the computer it resumes too."""
 SAFETY_STOP = "The car was stopped for safety; check the car, then reset the fault and arm again."
 
 
@@ -151,12 +153,13 @@ class Actuator(Resource):
     def stop(self, *, planned: bool) -> None:
         """Send neutral and disarm; ``planned=False`` latches a fault. Returns after three neutral frames.
 
-        Does nothing if the actuator is closed or the sender has ended. Waits two seconds at most, and not at all for
+        Does nothing if the actuator is closed or the sender has ended. Waits two seconds at most, and 0.1 s for
         a sender that hangs: the order stays in its slot, and the sender executes it when it resumes. Logs a warning if
         a planned stop of an armed actuator fails; after another stop the fault is known.
         """
         if not self.is_open or not self._is_sender_alive():
             return
+        sender = self._opened()
         with self._lock:
             if not planned:
                 self._latched = self._latched or SAFETY_STOP
@@ -165,7 +168,7 @@ class Actuator(Resource):
 
         def is_over(status: SenderStatus) -> bool:
             is_neutral = status.epoch >= epoch and (status.is_neutral_settled or not status.is_sending)
-            return status.is_ended or is_neutral or _hangs(status)
+            return status.is_ended or is_neutral or _hangs(sender)
 
         status = self._await(is_over, ANSWER_TIMEOUT_S)
         if planned and is_armed and not status.is_neutral_settled:
@@ -286,13 +289,14 @@ class Actuator(Resource):
 
     def _require_live_status(self, sender: Sender) -> SenderStatus:
         """Status of a running sender; a sender that hangs is a fault, even if it resumes."""
+        hangs = _hangs(sender)
         status, name = sender.status(), self.config.device_kind.name
         if not sender.is_alive():
             raise ActuatorFaultError(
                 status.fault
                 or f"The sender process has ended; the {name}'s own time-out stops the motor. Open the car again."
             )
-        if _hangs(status):
+        if hangs:
             raise self._latch(
                 f"The sender process hangs; the {name}'s own time-out stops the motor. Open the car again."
             )
@@ -364,6 +368,11 @@ class Actuator(Resource):
         return kind.silent_hint
 
 
-def _hangs(status: SenderStatus) -> bool:
-    """Whether the sender has published no status for ``SILENT_SENDER_S``."""
-    return time.monotonic() - status.t_published_s > SILENT_SENDER_S
+def _hangs(sender: Sender) -> bool:
+    """Whether the sender has published no status for ``SILENT_SENDER_S``, and publishes none in ``RESUME_POLLS``."""
+    for _ in range(RESUME_POLLS):
+        status = sender.status()
+        if time.monotonic() - status.t_published_s <= SILENT_SENDER_S or not sender.is_alive():
+            return False
+        time.sleep(POLL_S)
+    return True
