@@ -93,7 +93,6 @@ def drive(
         NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. SafetyStop: the control loop hung.
     """
     from carlab.cars import choose_car
-    from carlab.experiment.campaign.live_view import LiveSettings, LiveView
 
     hooks = hooks or RunHooks()
     _check(policy, max_throttle, episodes=episodes, ticks=ticks, seed=seed)
@@ -103,6 +102,8 @@ def drive(
     driver, chosen_task = _policy_and_task(policy, task, track, choice)
     with new_run(out, name, choice, hooks) as run, contextlib.ExitStack() as stack:
         if connect is not None:
+            from carlab.experiment.campaign.live_view import LiveSettings, LiveView  # imports torch
+
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
         with run_results(run, picture) as results:

@@ -20,13 +20,12 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import CarlabError
 from carlab.core.quantities import Action, CarState
 from drivers.calibration import MOTOR_SCALES, ActuatorCalibration, MotorKind
-from drivers.emulators.can_firmware import CanFirmware
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VALUES_AT_REST, VescFirmware
@@ -37,6 +36,9 @@ from mocap.emulators.scene import EmulatedBody, RigidBodySample
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.plant import Plant
 from sim_backends.sensor import MocapSensor
+
+if TYPE_CHECKING:
+    from drivers.emulators.can_firmware import CanFirmware
 
 ERPM_PER_MPS = 3000.0
 WAIT_AFTER_TIMEOUT_S = 0.5
@@ -90,6 +92,8 @@ class World:
                 firmware, link=Path(config.serial_link) if config.serial_link else None, baud=115200
             )
         else:
+            from drivers.emulators.can_firmware import CanFirmware  # its libraries take two fifths of the start
+
             self.firmware = CanFirmware(firmware, "udp_multicast", config.can_channel)
         self.server = NatNetServer(
             self._poses,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -166,3 +168,13 @@ def test_default_episode_has_the_same_duration_at_another_control_rate(tmp_path:
     ticks = [run.episodes[0].data.ticks for run in (slow, fast)]
     assert ticks == [33, 100]
     assert slow.episodes[0].total_reward == pytest.approx(fast.episodes[0].total_reward, rel=0.1)
+
+
+def test_drive_without_a_viewer_loads_neither_torch_nor_scipy(tmp_path: Path) -> None:
+    """They load for several seconds, and only the view of a learning run needs them."""
+    code = (
+        "import sys, carlab; carlab.drive(policy='neutral', ticks=2, out=sys.argv[1], rerun=False, picture=False); "
+        "print({'torch', 'scipy', 'stable_baselines3', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
