@@ -10,6 +10,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from pauses import pytest_runtest_protocol as pytest_runtest_protocol
+from pauses import pytest_terminal_summary as pytest_terminal_summary
 from short_fits import shorten_identification, shorten_inference
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"

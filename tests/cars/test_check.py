@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import pytest
+
 import carlab
 from carlab.cars.emulated_world import World, WorldConfig
 from drivers.emulators.serial_firmware import SerialFirmware
@@ -21,6 +23,7 @@ corners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]
 """
 
 
+@pytest.mark.realtime
 def test_fault_during_the_check_is_a_problem_among_the_readings(tmp_path: Path) -> None:
     with World(WorldConfig(SimulatorConfig().to_tables())) as world:
         firmware = world.firmware

@@ -10,6 +10,7 @@ from carlab.cli import run
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "readings.md"
 
 
+@pytest.mark.realtime
 def test_page_of_readings_lists_each_printed_reading(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", "--car", "emulated", "--seconds", "0.3"]) == 0
     table = capsys.readouterr().out.partition("Readings")[2].partition("\n\n")[0]

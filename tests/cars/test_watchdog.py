@@ -63,6 +63,7 @@ def motor_values(car: EmulatedCar, since_s: float) -> list[float]:
     return [value for _, name, value in entries if name in ("current", "brake", "duty")]
 
 
+@pytest.mark.realtime
 def test_emulated_car_holds_a_command_as_long_as_its_car_file_states(tmp_path: Path) -> None:
     path = car_file(tmp_path, 0.2, HARDWARE + LONG_WATCHDOG)
     with choose_car("emulated", vehicle=path).car as car:
@@ -91,6 +92,7 @@ def test_simulated_car_holds_a_command_as_long_as_its_car_file_states(tmp_path: 
     assert speeds_mps[1] > 2.0 * speeds_mps[0], "drive force for 0.92 s instead of 0.15 s"
 
 
+@pytest.mark.realtime
 def test_command_that_the_watchdog_replaced_is_reported(tmp_path: Path) -> None:
     events: list[SafetyEvent] = []
     path = car_file(tmp_path, 0.03, HARDWARE + "[hardware.actuator]\nlatch_s = 2.0\n" + TELEMETRY)

@@ -20,7 +20,13 @@ from carlab.core.errors import (
 )
 from carlab.core.quantities import NEUTRAL, Action, CarState, Reality
 
-KINDS = ["sim", "emulated", "emulated-can", "dry-run", pytest.param("real", marks=pytest.mark.hil)]
+KINDS = [
+    "sim",
+    pytest.param("emulated", marks=pytest.mark.realtime),
+    pytest.param("emulated-can", marks=pytest.mark.realtime),
+    "dry-run",
+    pytest.param("real", marks=pytest.mark.hil),
+]
 
 
 def build(kind: str, request: pytest.FixtureRequest) -> Car:

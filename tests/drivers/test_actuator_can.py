@@ -43,7 +43,10 @@ from carlab.core.quantities import Action
 from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
-config = ActuatorConfig(kind="vesc_can", interface="udp_multicast", channel=sys.argv[1])
+config = ActuatorConfig(
+    kind="vesc_can", interface="udp_multicast", channel=sys.argv[1],
+    watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0,
+)
 with Actuator(config, ActuatorCalibration()) as actuator:
     actuator.arm()
     print(actuator._sender.pid, flush=True)

@@ -56,7 +56,7 @@ def drive():
                 sys.exit(3)
             if failure == "hang":
                 report("hanging")
-                time.sleep(1.6)
+                time.sleep(2.4)
             if failure == "fork":
                 pid = os.fork()
                 if pid == 0:
@@ -197,7 +197,8 @@ def test_every_signal_to_the_main_process_ends_in_neutral(firmware: SerialFirmwa
         t_s = time.monotonic()
         drive.end()
         neutral = assert_ended_in_neutral(firmware.log)
-        assert neutral[0].t_s - t_s < 1.0
+        moving_afterwards = [e for e in firmware.log.motor(t_s) if e.t_s < neutral[0].t_s]
+        assert len(moving_afterwards) < 100, "one second at the send rate"
 
 
 def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(firmware: SerialFirmware) -> None:

@@ -30,6 +30,7 @@ from drivers.links.serial_link import SerialLink
 from drivers.sender.logic import SenderState
 from drivers.vesc.payloads import FirmwareVersion, MotorValues, get_values, set_current
 from drivers.vesc.serial_codec import encode_frame
+from tests.helpers.pauses import RunningTime
 from tests.helpers.waiting import TIMEOUT_S, until
 
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
@@ -118,11 +119,10 @@ def test_watchdog_fault_is_latched_until_reset_and_arm(serial_firmware: SerialFi
         until(lambda: actuator.status().state == SenderState.ARMED)
         actuator.command(MOVING)
         until(lambda: actuator.status().state == SenderState.FAULT)
-        motor = serial_firmware.log.motor()
-        moving = [e.t_s for e in motor if e.value == 3.0]
+        moving = [e.t_s for e in serial_firmware.log.motor() if e.value == 3.0]
         assert moving
-        after = [e for e in motor if e.t_s > moving[-1]]
-        assert len(after) >= 3
+        until(lambda: len(serial_firmware.log.motor(moving[-1])) > 3)
+        after = [e for e in serial_firmware.log.motor() if e.t_s > moving[-1]]
         assert all(e.value == 0.0 for e in after)
         with pytest.raises(ActuatorFaultError, match=r"no command arrived for 0\.5 s"):
             actuator.command(MOVING)
@@ -162,7 +162,7 @@ def test_firmware_fault_stops_and_persists(actuator: Actuator, serial_firmware: 
 
 
 def test_missing_telemetry_gives_neutral_then_a_fault(serial_firmware: SerialFirmware) -> None:
-    config = config_for(serial_firmware, telemetry_stale_s=0.25, telemetry_lost_s=1.0)
+    config = config_for(serial_firmware, telemetry_stale_s=0.25, telemetry_lost_s=1.6)
     with Actuator(config, CALIBRATION) as actuator:
         actuator.arm()
         until(lambda: not actuator.command(MOVING).is_neutral)
@@ -181,7 +181,9 @@ def test_missing_telemetry_gives_neutral_then_a_fault(serial_firmware: SerialFir
         assert neutral[-1].t_s - neutral[0].t_s > 0.4, "neutral is sent well before the fault"
         neutral_from_s = next(t_s for t_s, is_neutral in returned if is_neutral)
         assert all(is_neutral for t_s, is_neutral in returned if t_s > neutral_from_s)
-        assert abs(neutral_from_s - moving[-1]) < 0.25, "the reported command is neutral from then on, too"
+        assert neutral_from_s > moving[-1] - 0.25
+        moving_until_s = max(t_s for t_s, is_neutral in returned if not is_neutral)
+        assert moving_until_s < moving[-1] + 0.25, "the reported command is neutral from then on, too"
 
 
 def test_replugged_device_gets_neutral_until_reset_and_arm(serial_firmware: SerialFirmware) -> None:
@@ -376,9 +378,9 @@ def test_stop_does_not_wait_for_a_hanging_sender(actuator: Actuator, serial_firm
     os.kill(actuator._sender.pid, signal.SIGSTOP)  # type: ignore[attr-defined]
     try:
         until(lambda: time.monotonic() - actuator.status().t_published_s > 0.6)
-        begin_s = time.monotonic()
-        actuator.stop(planned=False)
-        assert time.monotonic() - begin_s < 1.0
+        with RunningTime() as running:
+            actuator.stop(planned=False)
+        assert running.seconds < 1.0
     finally:
         t_resumed_s = time.monotonic()
         os.kill(actuator._sender.pid, signal.SIGCONT)  # type: ignore[attr-defined]

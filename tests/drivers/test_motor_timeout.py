@@ -16,7 +16,8 @@ from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.sender.logic import Order, Request, SenderLogic, SenderState
 from drivers.vesc.payloads import FirmwareVersion, MotorValues
-from tests.helpers.waiting import until
+from tests.helpers.pauses import RunningTime
+from tests.helpers.waiting import TIMEOUT_S, until
 
 MOVING = Action(0.5, 0.3)
 CALIBRATION = ActuatorCalibration()
@@ -37,8 +38,12 @@ def connected(firmware: SerialFirmware) -> Actuator:
 def test_timeout_is_measured_in_neutral_and_the_car_can_be_armed_afterwards() -> None:
     with served(0.3) as firmware, connected(firmware) as actuator:
         assert "vesc_time_to_motor_release_s" not in actuator.health().readings
-        actuator.measure_motor_timeout()
-        assert 0.3 <= actuator.health().readings["vesc_time_to_motor_release_s"] < 1.0
+        for _ in range(3):  # a pause of the machine prolongs a measurement
+            actuator.measure_motor_timeout()
+            time_to_release_s = actuator.health().readings["vesc_time_to_motor_release_s"]
+            if time_to_release_s < 1.0:
+                break
+        assert 0.3 <= time_to_release_s < 1.0
         assert any(entry.name == "motor_timeout" for entry in firmware.log.entries())
         assert all(entry.value == 0.0 for entry in firmware.log.motor())
         assert actuator.health().readings["vesc_motor_timeout_flag"] == 0.0
@@ -74,8 +79,9 @@ def test_stop_of_another_thread_ends_the_measurement_with_neutral() -> None:
         until(lambda: actuator.status().epoch == 1)
         count = len(firmware.log.motor())
         actuator.stop(planned=False)
-        thread.join(1.0)
-        assert not thread.is_alive()
+        with RunningTime() as running:
+            thread.join(TIMEOUT_S)
+        assert running.seconds < 1.0
         until(lambda: len(firmware.log.motor()) >= count + 3)
         assert actuator.status().state == SenderState.FAULT
 
@@ -86,8 +92,9 @@ def test_lost_link_ends_the_measurement() -> None:
         thread.start()
         until(lambda: actuator.status().epoch == 1)
         firmware.unplug()
-        thread.join(1.0)
-        assert not thread.is_alive()
+        with RunningTime() as running:
+            thread.join(TIMEOUT_S)
+        assert running.seconds < 1.0
 
 
 class Bench:

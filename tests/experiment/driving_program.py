@@ -92,7 +92,8 @@ def main(folder: str, misbehaviour: str) -> int:
 
     with car:
         sender = car.hardware.actuator._sender
-        print(json.dumps({"run": str(run.path), "main": os.getpid(), "sender": sender.pid}), flush=True)  # type: ignore[union-attr]
+        world = car.world.addresses["pid"]
+        print(json.dumps({"run": str(run.path), "main": os.getpid(), "sender": sender.pid, "world": world}), flush=True)  # type: ignore[union-attr]
         session = Session(
             car,
             MisbehavingPolicy(misbehaviour),

@@ -35,6 +35,7 @@ class Driving:
     run: Path
     main: int
     sender: int
+    world: int
     last_line: str = ""
 
     def until(self, start: str) -> str:
@@ -86,7 +87,7 @@ def driving(folder: Path, misbehaviour: str) -> Iterator[Driving]:
         line = process.stdout.readline()
         assert line, process.stderr.read() if process.stderr else ""
         facts = json.loads(line)
-        yield Driving(process, Path(facts["run"]), facts["main"], facts["sender"])
+        yield Driving(process, Path(facts["run"]), facts["main"], facts["sender"], facts["world"])
     finally:
         process.kill()
         process.wait()
@@ -275,3 +276,26 @@ def test_suspended_program_is_stopped_by_its_sender(tmp_path: Path) -> None:
         moving_afterwards = [e for e in program.firmware_log() if e.name == "current" and e.value != 0.0]
         assert moving_afterwards[-1].t_s < suspended_s + 0.4
         assert program.recording.metadata["end_reason"] in ("ACTUATOR_FAULT", "POSE_STALE", "LOOP_HUNG")
+
+
+def test_pause_of_the_whole_computer_ends_the_episode_with_its_reason(tmp_path: Path) -> None:
+    """All processes stop for 0.8 s and resume together: neither the sender nor the control loop hangs."""
+    with driving(tmp_path, "well_behaved") as program:
+        program.until(f"tick {BREAK_AT_TICK}")
+        processes = (program.main, program.sender, program.world)
+        for pid in processes:
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(0.8)
+        resumed_s = time.monotonic()
+        for pid in processes:
+            os.kill(pid, signal.SIGCONT)
+        assert program.end() == 4
+        log = program.firmware_log()
+        assert_neutral_at_the_end(log)
+        recording = program.recording
+        reason = recording.metadata["end_reason"]
+        assert program.last_line == f"ended {reason}"
+        assert reason in ("ACTUATOR_FAULT", "POSE_STALE")
+        assert "hangs" not in recording.metadata["end_detail"]
+        moving = [e for e in log if e.name == "current" and e.value != 0.0 and e.t_s > resumed_s]
+        assert len(moving) <= 3, "commands in transmission"

@@ -293,10 +293,10 @@ def test_clock_step_of_the_server_is_detected_and_no_pose_is_in_the_future(
         until(lambda: len(received.frames) >= 30)
         server.faults = ServerFaults(clock_offset_s=500.0)
         until(lambda: client.statistics()["clock_resets"] == 1.0)
+        numbers = client.statistics()  # a later echo may have a shorter round trip than those of the frames
         count = len(received.frames)
         until(lambda: len(received.frames) >= count + 60)
-        numbers = client.statistics()
-    assert numbers["mistimed"] > 0.0
+        assert client.statistics()["mistimed"] > 0.0
     assert abs(median(received.errors_s(count + 10))) < tolerance_s(numbers)
     assert all(capture_s <= received_s + 5e-3 for _, _, capture_s, received_s in received.frames)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from natnet import DataDescriptions, DataFrame
 from natnet import NatNetClient as OtherClient
@@ -112,10 +113,9 @@ def test_independent_client_receives_the_frames(
     assert numbers == sorted(set(numbers))
     between = [n for n in list(sent) if numbers[0] <= n <= numbers[-1]]
     assert len(numbers) > 0.95 * len(between)
-    # From the first exposure to the last, so that the time until the client is connected does not count.
-    exposures = [frame.suffix.stamp_camera_mid_exposure for frame in (frames[0], frames[-1])]
-    elapsed_s = (exposures[1] - exposures[0]) / CLOCK_HZ
-    assert 100.0 < (len(numbers) - 1) / elapsed_s < 260.0, "the server skips frames on a busy machine"
+    # The median interval: a pause of the machine is one long interval.
+    intervals_s = np.diff([frame.suffix.stamp_camera_mid_exposure for frame in frames]) / CLOCK_HZ
+    assert 100.0 < 1.0 / np.median(intervals_s) < 260.0, "the server skips frames on a busy machine"
 
     for frame in frames:
         check_frame(frame, sent[frame.prefix.frame_number], server)

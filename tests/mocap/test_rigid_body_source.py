@@ -101,6 +101,7 @@ def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Un
 
     with RigidBodyPoseSource(configure(serve(tilted))) as source:
         until(lambda: source.statistics()["tracked"] >= 5.0)
+        until(lambda: len(source.problems()) == 1)
         (text,) = source.problems()
         assert "tilted" in text
         assert 'up_axis = "z"' in text
@@ -119,10 +120,11 @@ def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Un
     [(((120.0, 0.0, 30.0), (-100.0, 50.0, 20.0)), (0.0, 0.0, 30.0)), ((), (1200.0, -800.0, 30.0))],
 )
 def test_millimetres_are_reported(
-    serve: Serve, configure: Configure, markers_m: Any, position_m: tuple[float, float, float]
+    serve: Serve, configure: Configure, until: Until, markers_m: Any, position_m: tuple[float, float, float]
 ) -> None:
     server = serve(lambda t_s: [RigidBodySample(t_s, position_m)], bodies=(EmulatedBody("car", 1, markers_m),))
     with RigidBodyPoseSource(configure(server)) as source:
+        until(lambda: len(source.problems()) == 1)
         (text,) = source.problems()
         assert "the server does not seem to stream metres; set its unit of length to metres." in text
 
