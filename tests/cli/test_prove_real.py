@@ -9,7 +9,6 @@ from recorded_drives import drive
 
 from carlab.api.cars import load_car
 from carlab.cli.prove_real import car_path
-from carlab.jobs import child_jobs
 from carlab.recording.csv.export import write_csv
 from sim_backends import SimulatorConfig
 
@@ -28,7 +27,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recordings_of_a_folder_are_sealed_answered_and_scored(
     data: Path, tmp_path: Path, carlab: Carlab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(child_jobs, "CARLAB", (sys.executable, str(FAKE)))
+    monkeypatch.setattr("carlab.cli.prove.CARLAB", (sys.executable, str(FAKE)))
     options = ("prove", "--set", "real", "--data", data, "--car", "rc_car", "--out", tmp_path / "proof", "--limit", 3)
     code, text = carlab(*options)
     assert code == 0, text
@@ -36,6 +35,7 @@ def test_recordings_of_a_folder_are_sealed_answered_and_scored(
     assert (tmp_path / "proof" / "scores.json").exists()
     page = (tmp_path / "proof" / "results.md").read_text()
     assert "false alarms, untouched recordings" in page
+    assert "answered steering_offset" in page, "the fake has answered"
     first = (tmp_path / "proof" / "seal.json").read_bytes()
     assert carlab(*options)[0] == 0
     assert (tmp_path / "proof" / "seal.json").read_bytes() == first
