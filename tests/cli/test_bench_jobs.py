@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -88,14 +87,18 @@ def scores_in(path: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in score.items() if k != "seconds"} for score in json.loads(path.read_text())["scores"]]
 
 
-@pytest.fixture(scope="module")
-def regression_scores(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+def scores_here(folder: Path) -> list[dict[str, Any]]:
     """Scores of the study in this process."""
     from carlab.cli import run
 
-    out = tmp_path_factory.mktemp("here") / "out.json"
+    out = folder / "out.json"
     assert run([str(word) for word in (*REGRESSION, "--out", out)]) == 0
     return scores_in(out)
+
+
+@pytest.fixture(scope="module")
+def regression_scores(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    return scores_here(tmp_path_factory.mktemp("here"))
 
 
 def assert_equal_scores(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> None:
@@ -133,16 +136,16 @@ def test_jobs_on_ray_have_the_scores_of_one_process(
     assert json.loads(out.read_text())["device"] == "cpu of Ray local"
 
 
-def test_lost_worker_costs_its_fits_and_nothing_else(
-    carlab: Carlab, executor: FakeExecutor, regression_scores: list[dict[str, Any]], tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("short_inference", "short_identification")
+def test_lost_worker_costs_its_fits_and_nothing_else(carlab: Carlab, executor: FakeExecutor, tmp_path: Path) -> None:
     executor.lost = ("1",)
-    out = tmp_path / "out.json"
+    out = tmp_path / "jobs.json"
     code, text = carlab(*REGRESSION, "--out", out, "--ray", "local")
     assert code == 1
     assert "SysID, 2 rows, seed 1 failed: worker lost: the machine is gone" in text
     scores = scores_in(out)
-    assert_equal_scores([s for s in scores if s["failed"] is None], [s for s in regression_scores if s["seed"] == 0])
+    expected = [s for s in scores_here(tmp_path) if s["seed"] == 0]
+    assert_equal_scores([s for s in scores if s["failed"] is None], expected)
     assert [(s["method"], s["seed"], s["nll"]) for s in scores if s["failed"] is not None] == [
         ("SysID", 1, None),
         ("gp-posterior", 1, None),
@@ -166,7 +169,6 @@ def test_job_of_recordings_gets_its_files_only(
     model = tmp_path / "model.toml"
 
     model.write_text(tomli_w.dumps(load_car_file(Path("rc_car")).simulator.to_tables()))
-    executor.run_here = partial(run_forked_job, with_short_inference=True)
     out, alone = tmp_path / "out.json", tmp_path / "alone.json"
     study = ("bench", "priors", "--data", recordings, "--car", "rc_car", "--diagnosed", model, "--rows", 20)
     study += ("--seeds", 1, "--first-seed", 3, "--history", 3, "--steps", 30)

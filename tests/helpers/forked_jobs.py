@@ -1,4 +1,4 @@
-"""Jobs in forks of a process that has imported carlab, which spares each job seconds of imports."""
+"""Jobs with short fits in forks of a process that has imported carlab, which spares each job seconds of imports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from short_fits import shorten_inference
+from short_fits import shorten_identification, shorten_inference
 
 from carlab.cli import run
 from carlab.experiment.campaign.child_process import child_context
@@ -17,26 +17,22 @@ from carlab.jobs.child_jobs import PYTHON, ChildJob, JobEnd, read_files, write_f
 from carlab.jobs.child_processes import ChildEnd
 
 
-def run_forked_job(
-    job: ChildJob, abandon: Callable[[], bool] = lambda: False, *, with_short_inference: bool = False
-) -> JobEnd:
+def run_forked_job(job: ChildJob, abandon: Callable[[], bool] = lambda: False) -> JobEnd:
     """Run a job of the command ``carlab`` as ``run_job`` does, but in a fork; ``abandon`` is not polled."""
     assert job.command[:3] == (PYTHON, "-m", "carlab")
     with tempfile.TemporaryDirectory(prefix="job-") as fresh:
         folder = Path(fresh)
         write_files(folder, job.inputs)
-        child = child_context().Process(
-            target=_carlab, args=(job.command[3:], folder, dict(job.environment), with_short_inference)
-        )
+        child = child_context().Process(target=_carlab, args=(job.command[3:], folder, dict(job.environment)))
         child.start()
         child.join()
         end = ChildEnd(child.exitcode, 0.0, "", 0.0)
         return JobEnd(end, {k: v for name in job.outputs for k, v in read_files(folder, name).items()})
 
 
-def _carlab(arguments: tuple[str, ...], folder: Path, environment: dict[str, str], with_short_inference: bool) -> None:
-    if with_short_inference:
-        shorten_inference(pytest.MonkeyPatch())
+def _carlab(arguments: tuple[str, ...], folder: Path, environment: dict[str, str]) -> None:
+    shorten_inference(pytest.MonkeyPatch())
+    shorten_identification(pytest.MonkeyPatch())
     os.chdir(folder)
     os.environ.update(environment)
     with open(os.devnull, "w") as nowhere:
