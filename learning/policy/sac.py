@@ -27,6 +27,7 @@ from learning.devices import CapturedFunction, can_capture, denormals_flushed
 from learning.networks.adam import Adam
 from learning.networks.array_file import checked_tensor, whole_number
 from learning.networks.particles import Layers, Network, Pullback
+from learning.networks.uncompiled_optimisers import uncompiled_optimisers
 
 _LOG_OFFSET = 1e-6
 """Offset inside the logarithm of tanh's derivative, as in stable-baselines3."""
@@ -78,7 +79,8 @@ class FastSac(SAC):
     """
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        with uncompiled_optimisers():
+            super()._setup_model()
         policy = self.policy
         plain = policy.features_extractor_class is FlattenExtractor and policy.activation_fn is nn.ReLU
         if not plain or self.use_sde or self.log_ent_coef is None:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
+from learning.networks.uncompiled_optimisers import uncompiled_optimisers
 from learning.outliers import DOF_CANDIDATES, log_student, tail_scales
 from learning.posterior.sampler import Assignment
 from learning.world.car_dynamics import CarDynamics
@@ -185,7 +186,8 @@ def _maximise_scale(
 ) -> tuple[float, tuple[float, float, float]]:
     """Mean log density and scales at its maximum; the scale of a rollout is one of ``components`` (C,)."""
     log_scale = torch.zeros(len(CHANNELS), dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([log_scale], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
+    with uncompiled_optimisers():
+        optimiser = torch.optim.LBFGS([log_scale], max_iter=_ITERATIONS, line_search_fn="strong_wolfe")
 
     def scales() -> Tensor:
         return log_scale.clamp(math.log(MIN_SCALE), math.log(MAX_SCALE)).exp()
@@ -196,7 +198,7 @@ def _maximise_scale(
         return math.log(len(components)) - torch.logsumexp(density, dim=0).mean()
 
     def closure() -> Tensor:
-        optimiser.zero_grad()
+        log_scale.grad = None
         value = loss()
         value.backward()  # type: ignore[no-untyped-call]
         return value
