@@ -117,6 +117,7 @@ class SpyRecorder(Recorder):
         super().emit(document)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("resumes", ["while the car is stopped", "after the end was emitted"])
 def test_hung_loop_that_resumes_does_not_end_the_episode_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resumes: str
@@ -195,6 +196,7 @@ def test_slow_policy_of_a_car_in_simulated_time_is_no_hanging_loop(tmp_path: Pat
     assert abandoned == []
 
 
+@pytest.mark.realtime
 def test_loop_that_resumes_after_the_car_was_closed_raises_where_it_hung(tmp_path: Path) -> None:
     abandoned = threading.Event()
 
