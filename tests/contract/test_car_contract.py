@@ -44,12 +44,21 @@ def closed_car(request: pytest.FixtureRequest) -> Iterator[Car]:
     car.close()
 
 
+@pytest.fixture(scope="module", params=KINDS)
+def opened_car(request: pytest.FixtureRequest) -> Iterator[Car]:
+    """One car of each kind for all tests that need no new one; an emulated car has three processes."""
+    with build(request.param, request) as car:
+        yield car
+
+
 @pytest.fixture
-def car(closed_car: Car) -> Iterator[Car]:
-    with closed_car:
-        yield closed_car
-        if closed_car.reality is Reality.REAL:
-            assert problems_after_waiting(closed_car) == ()
+def car(opened_car: Car) -> Iterator[Car]:
+    """An open car that is disarmed and has no fault."""
+    yield opened_car
+    if opened_car.reality is Reality.REAL:
+        assert problems_after_waiting(opened_car) == ()
+    opened_car.stop(planned=True)
+    opened_car.reset_fault()
 
 
 def problems_after_waiting(car: Car) -> tuple[str, ...]:
@@ -118,10 +127,11 @@ def test_observations_are_fresh_and_advance(car: Car) -> None:
     assert second.velocity_delay_s > 0.0
 
 
-def test_only_neutral_is_accepted_before_arming(car: Car) -> None:
-    assert car.command(NEUTRAL).is_neutral
-    with pytest.raises(NotArmedError):
-        car.command(Action(0.2, 0.2))
+def test_only_neutral_is_accepted_before_arming(closed_car: Car) -> None:
+    with closed_car:
+        assert closed_car.command(NEUTRAL).is_neutral
+        with pytest.raises(NotArmedError):
+            closed_car.command(Action(0.2, 0.2))
 
 
 @pytest.mark.parametrize(

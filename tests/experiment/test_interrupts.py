@@ -170,6 +170,7 @@ def test_loop_that_hangs_in_the_log_is_stopped() -> None:
     assert stopped == ["logging"]
 
 
+@pytest.mark.realtime
 def test_loop_watch_does_not_stop_a_beating_or_paused_loop() -> None:
     stopped: list[str] = []
     with LoopWatch(lambda where, stack: stopped.append(where), timeout_s=0.5) as watch:

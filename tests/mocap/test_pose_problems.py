@@ -91,6 +91,7 @@ def test_frames_that_are_being_recorded_are_live() -> None:
     assert client.is_live
 
 
+@pytest.mark.realtime
 def test_missing_clock_echo_is_a_problem_of_a_server_with_a_clock_only(
     serve: Serve, configure: Configure, monkeypatch: pytest.MonkeyPatch
 ) -> None:

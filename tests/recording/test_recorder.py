@@ -283,6 +283,7 @@ for document in module._documents(100000, end=False):
 """
 
 
+@pytest.mark.realtime
 def test_sigkill_loses_at_most_half_a_second(tmp_path, request):
     path = tmp_path / "0001.mcap"
     conftest = request.path.with_name("conftest.py")
