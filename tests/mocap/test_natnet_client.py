@@ -27,6 +27,8 @@ from mocap.natnet.models import (
 )
 from mocap.natnet_client import NatNetClient
 
+pytestmark = pytest.mark.realtime
+
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
 Until = Callable[[Callable[[], bool]], None]

@@ -15,6 +15,8 @@ from mocap.natnet.models import BitstreamVersion, MessageId, ServerMode
 from mocap.natnet_client import NatNetClient
 from mocap.rigid_body import RigidBodyPoseSource
 
+pytestmark = pytest.mark.realtime
+
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
 Until = Callable[[Callable[[], bool]], None]
@@ -91,7 +93,6 @@ def test_frames_that_are_being_recorded_are_live() -> None:
     assert client.is_live
 
 
-@pytest.mark.realtime
 def test_missing_clock_echo_is_a_problem_of_a_server_with_a_clock_only(
     serve: Serve, configure: Configure, monkeypatch: pytest.MonkeyPatch
 ) -> None:

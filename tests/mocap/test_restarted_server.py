@@ -13,6 +13,8 @@ from mocap.emulators.scene import EmulatedBody, RigidBodySample
 from mocap.natnet.models import MessageId
 from mocap.rigid_body import RigidBodyPoseSource
 
+pytestmark = pytest.mark.realtime
+
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
 Until = Callable[[Callable[[], bool]], None]

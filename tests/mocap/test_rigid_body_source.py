@@ -26,6 +26,8 @@ from mocap.natnet.models import BitstreamVersion, MarkerSetDescription, RigidBod
 from mocap.natnet.sockets import udp_socket
 from mocap.rigid_body import RigidBodyPoseSource, select_body
 
+pytestmark = pytest.mark.realtime
+
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
 Until = Callable[[Callable[[], bool]], None]
