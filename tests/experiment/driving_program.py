@@ -21,7 +21,6 @@ from carlab.core.quantities import Action, CarState
 from carlab.core.task import RecordedTask
 from carlab.experiment.episodes.hooks import RunHooks
 from carlab.experiment.episodes.session import Session
-from carlab.recording.rerun.sink import RerunSink
 from carlab.recording.run_folder import RunDirectory
 
 MISBEHAVE_AT_TICK = 20
@@ -59,6 +58,8 @@ def main(folder: str, misbehaviour: str) -> int:
     car = EmulatedCar(default_car())
     car.log_to(run.path)
     if misbehaviour == "recorder_error":
+        from carlab.recording.rerun.sink import RerunSink
+
         original_write = RerunSink._write
         n_writes = [0]
 

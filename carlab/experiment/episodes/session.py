@@ -34,9 +34,8 @@ from carlab.experiment.episodes.interrupts import Interrupts, LoopWatch
 from carlab.experiment.episodes.result import EpisodeResult, result_of
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.recorder import Recorder
-from carlab.recording.rerun.sink import RerunSink
 from carlab.recording.run_folder import RunDirectory
-from carlab.recording.sink import LogLine
+from carlab.recording.sink import LogLine, Sink
 
 log = logging.getLogger(__name__)
 
@@ -98,8 +97,10 @@ class Session:
 
     def _drive_one(self, number: int, interrupts: Interrupts) -> EpisodeResult:
         path = self.run.episode_path(number, ".mcap")
-        sinks: list[McapSink | RerunSink] = [McapSink(path, self.metadata)]
+        sinks: list[Sink] = [McapSink(path, self.metadata)]
         if self.record_rerun:
+            from carlab.recording.rerun.sink import RerunSink  # loads rerun
+
             sinks.append(RerunSink(self.run.episode_path(number, ".rrd")))
         recorder = Recorder(sinks)
         emitter = _Emitter(recorder, self.hooks)
