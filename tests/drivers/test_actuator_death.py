@@ -36,7 +36,10 @@ from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 
 port, failure = sys.argv[1:3]
-actuator = Actuator(ActuatorConfig(port=port, watchdog_s=0.4, latch_s=1.0), ActuatorCalibration())
+config = ActuatorConfig(
+    port=port, watchdog_s=0.4, latch_s=1.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0, open_timeout_s=20.0
+)
+actuator = Actuator(config, ActuatorCalibration())
 
 def report(*values):
     print(*values, flush=True)
