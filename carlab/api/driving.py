@@ -36,9 +36,12 @@ from carlab.experiment.episodes.result import EpisodeResult
 from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 
 if TYPE_CHECKING:
+    from rerun import RecordingStream
+
     from carlab.cars import CarChoice, CarFile
     from carlab.core.safety import SafetyEnvelope
     from carlab.core.task_choice import TaskChoice
+    from carlab.experiment.campaign.live_view import LiveView
     from carlab.recording.run_folder import RunDirectory
     from sim_backends.car_parameters import SimulatorConfig
 
@@ -102,13 +105,18 @@ def drive(
     driver, chosen_task = _policy_and_task(policy, task, track, choice)
     with new_run(out, name, choice, hooks) as run, contextlib.ExitStack() as stack:
         if connect is not None:
-            from carlab.experiment.campaign.live_view import LiveSettings, LiveView  # imports torch
-
-            view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
+            view = stack.enter_context(_live_view(run, episodes, connect))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
         with run_results(run, picture) as results:
             _drive(choice, driver, chosen_task, max_throttle, run, episodes, collecting(hooks, run, results), options)
     return DriveRun(run.path, tuple(results))
+
+
+def _live_view(run: RunDirectory, episodes: int, connect: Callable[[RecordingStream], None]) -> LiveView:
+    """The view of a run in a rerun viewer; it loads torch."""
+    from carlab.experiment.campaign.live_view import LiveSettings, LiveView
+
+    return LiveView(LiveSettings(run.path, episodes, False, connect))
 
 
 def replay(
