@@ -105,6 +105,7 @@ def test_adapter_that_is_plugged_in_again_gets_neutral(tmp_path: Path, channel: 
         commands = firmware.log.motor(t_plugged_s)
         assert all(e.value == 0.0 for e in commands)
         assert commands[0].t_s - t_plugged_s < max(RECONNECT_PERIODS_S) + slcan_link.BOOT_S + 1.0
+        until(lambda: actuator.status().t_telemetry_s > t_plugged_s)
         actuator.reset_fault()
         actuator.arm()
 
