@@ -6,13 +6,16 @@ This method is carlab's, not the algorithm of Rothfuss et al. (arXiv 2403.16644)
 Particles are moved until they have these moments at many small measurement sets: Stein's direction with a linear kernel
 (``learning.stein.moment_direction``; Liu and Wang 2018, "Stein Variational Gradient Descent as Moment Matching"),
 pulled back to the networks' parameters as in algorithm 1 of the paper.
+
+A particle is a network that replaces the simulator, or the simulator with a draw of its parameters and a network that
+corrects its steps. Such a network has the moments of the model discrepancy given its draw.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,7 +27,9 @@ from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.function_posterior import JITTER, FunctionPosterior
 from learning.posterior.particle_posterior import ParticlePosterior, input_clip_of
+from learning.posterior.particle_simulator import ParticleSimulator
 from learning.priors.domain_models import DomainModel
+from learning.priors.simulator_model import CarModel
 from learning.stein import moment_direction
 
 PROGRESS_PERIOD_STEPS = 200
@@ -63,6 +68,7 @@ class DistillationSettings:
         learning_rate: initial rate; it falls to ``FINAL_RATE_SHARE`` of it along a half cosine.
         activation: of the hidden units.
         seed: of all draws.
+        correct_simulator: whether a particle is the simulator with a draw of its parameters, corrected by a network.
     """
 
     particles: int = 20
@@ -73,6 +79,7 @@ class DistillationSettings:
     learning_rate: float = 1.5e-2
     activation: Activation = "silu"
     seed: int = 0
+    correct_simulator: bool = False
 
     @property
     def domain_points(self) -> int:
@@ -89,12 +96,16 @@ class _Targets:
         mean: without the trend (B, O, N).
         cholesky: factors of the covariances (B, O, N, N).
         weight: of an error at each point (B, O, N).
+        trend: constant and slopes (1 + D, O).
+        deviation: of each particle's own mean from the mean (L, B, O, N); None: zero.
     """
 
     inputs: Tensor
     mean: Tensor
     cholesky: Tensor
     weight: Tensor
+    trend: Tensor
+    deviation: Tensor | None = None
 
 
 def distil(
@@ -131,29 +142,67 @@ def distil(
     count = len(points) // settings.points
     chosen = torch.randperm(len(points), generator=generator)[: count * settings.points].to(points.device)
     sets = points[chosen].view(count, settings.points, -1)
-    mean, covariance = target.marginals(sets)
-    cholesky, weight = _factors(covariance, target.noise_std)
-    inputs = normaliser.inputs(sets)
-    row_inputs = target.inputs[:, : inputs.shape[2]].to(inputs)
-    input_clip = input_clip_of(torch.cat([inputs.flatten(0, 1), row_inputs]))
-    trend = _trend(inputs, mean, weight)
-    targets = _Targets(inputs, mean - _linear(trend, inputs), cholesky, weight)
+    draws = _draws(target, len(parameters), generator) if settings.correct_simulator else None
+    targets = _targets(target, sets, draws)
+    row_inputs = target.inputs[:, : points.shape[1]].to(targets.inputs)
+    input_clip = input_clip_of(torch.cat([targets.inputs.flatten(0, 1), row_inputs]))
     with torch.no_grad():
         _train(network, parameters, targets, settings, generator, progress)
-        if not bool(torch.isfinite(parameters).all()):
-            raise DivergedError("The fit diverged; fit again with a smaller learning rate.")
-        max_misfit = math.inf
-        if len(target.inputs) >= MIN_ROWS_FOR_NOISE:
-            sets = target.data[:, None]
-            mean, covariance = target.marginals(sets)
-            weight, max_misfit = torch.ones_like(mean), MAX_MISFIT_STD
-            inputs = normaliser.inputs(sets)
-        values = network(parameters, inputs.flatten(0, 1)).view(-1, *sets.shape[:2], mean.shape[1]).transpose(2, 3)
-        variance = covariance.diagonal(dim1=2, dim2=3).to(values)
-        noise = _noise(values + _linear(trend, inputs), mean, variance, weight, target.noise_std, max_misfit)
-    return ParticlePosterior(
-        network, parameters, noise, normaliser, target.dof, trend, target.correlation, input_clip
+    if not bool(torch.isfinite(parameters).all()):
+        raise DivergedError("The fit diverged; fit again with a smaller learning rate.")
+    particles = ParticlePosterior(
+        network, parameters, target.noise_std, normaliser, target.dof, targets.trend, target.correlation, input_clip,
+        None if draws is None else _simulator(target, draws),
     )  # fmt: skip
+    return replace(particles, noise_std=_particle_noise(target, particles, sets, targets.weight))
+
+
+def _draws(target: FunctionPosterior, particles: int, generator: torch.Generator) -> Tensor:
+    """Indices (L,) of the particles' draws of the parameters; they repeat if the posterior has fewer.
+
+    Raises:
+        ValueError: the posterior has no simulator.
+    """
+    if target.model is None or target.parameters is None:
+        raise ValueError("the posterior has no simulator to correct")
+    order = torch.randperm(len(target.parameters), generator=generator)
+    return order[torch.arange(particles) % len(order)].to(target.parameters.device)
+
+
+def _simulator(target: FunctionPosterior, draws: Tensor) -> ParticleSimulator:
+    """The posterior's simulator with draws (L,)."""
+    assert isinstance(target.model, CarModel)
+    assert target.parameters is not None
+    return ParticleSimulator(target.model, target.parameters[draws])
+
+
+def _targets(target: FunctionPosterior, sets: Tensor, draws: Tensor | None) -> _Targets:
+    """Moments of the posterior at sets (B, N, D), or of the discrepancy given draws (L,) of the parameters."""
+    inputs = target.normaliser.inputs(sets)
+    means: Tensor | None = None
+    if draws is None:
+        mean, covariance = target.marginals(sets)
+    else:
+        means, covariance = target.discrepancy_marginals(sets, draws)
+        mean = means.mean(dim=0)
+    cholesky, weight = _factors(covariance, target.noise_std)
+    trend = _trend(inputs, mean, weight)
+    deviation = None if means is None else means - mean
+    return _Targets(inputs, mean - _linear(trend, inputs), cholesky, weight, trend, deviation)
+
+
+def _particle_noise(target: FunctionPosterior, particles: ParticlePosterior, sets: Tensor, weight: Tensor) -> Tensor:
+    """Noise (O,) of particles, from their misfit at the rows, or with few rows at measurement sets (B, N, D)."""
+    max_misfit = math.inf
+    if len(target.inputs) >= MIN_ROWS_FOR_NOISE:
+        sets, max_misfit = target.data[:, None], MAX_MISFIT_STD
+    mean, covariance = target.marginals(sets)
+    weight = torch.ones_like(mean) if len(target.inputs) >= MIN_ROWS_FOR_NOISE else weight
+    with torch.no_grad():
+        values = particles.values(particles.normaliser.inputs(sets).flatten(0, 1))
+    values = values.view(-1, *sets.shape[:2], mean.shape[1]).transpose(2, 3)
+    variance = covariance.diagonal(dim1=2, dim2=3).to(values)
+    return _noise(values, mean, variance, weight, target.noise_std, max_misfit)
 
 
 def _train(
@@ -173,7 +222,10 @@ def _train(
         values, pullback = network.through(layers, targets.inputs[sets].flatten(0, 1))
         by_set = values.view(particles, settings.sets, settings.points, outputs)
         # Rows are pairs of set and output: (L, sets * outputs, points).
-        rows = by_set.transpose(2, 3).flatten(1, 2)
+        rows = by_set.transpose(2, 3)
+        if targets.deviation is not None:
+            rows = rows - targets.deviation[:, sets]
+        rows = rows.flatten(1, 2)
         direction = moment_direction(rows, targets.mean[sets].flatten(0, 1), targets.cholesky[sets].flatten(0, 1))
         direction = direction * targets.weight[sets].flatten(0, 1)
         direction = direction.view(particles, settings.sets, outputs, settings.points)

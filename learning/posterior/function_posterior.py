@@ -89,29 +89,60 @@ class FunctionPosterior:
         means = self.normaliser.raw_outputs(mean[:, :, 0])[None]
         return Mixture(means, std[None], self.dof, decorrelation, self.correlation)
 
+    def discrepancy_marginals(self, sets: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
+        """Moments of the model discrepancy at measurement sets, given draws of the parameters.
+
+        Args:
+            sets: raw inputs (B, N, D).
+            draws: indices of the draws (L,).
+
+        Returns:
+            Means (L, B, O, N), single precision, and covariances (B, O, N, N), double precision, of every draw.
+        """
+        batches = []
+        for part in torch.split(sets, max(_MAX_BATCH_POINTS // sets.shape[1], 1)):
+            at, simulated = self._simulated(part.flatten(0, 1))
+            change, covariance = self._discrepancy(at.view(*part.shape[:2], -1))
+            change = change.expand_as(simulated)[:, draws]
+            by_set = change.reshape(*change.shape[:2], *part.shape[:2])
+            batches.append((by_set.permute(1, 2, 0, 3).float(), covariance))
+        return torch.cat([m for m, _ in batches], dim=1), torch.cat([c for _, c in batches])
+
     def _batch_marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
         count, points = sets.shape[:2]
-        flat = sets.flatten(0, 1)
-        at = self.normaliser.inputs(flat).double()
         outputs = len(self.noise_std)
-        if self.model is None or self.parameters is None:
-            draws = torch.zeros((outputs, 1, len(flat)), dtype=torch.float64, device=flat.device)
-        else:
-            draws = simulate(self.model, flat, self.parameters, self.normaliser).permute(2, 0, 1)
-            at = torch.cat([at, draws.mean(dim=1).T], dim=1)
-        covariance = torch.zeros((count, outputs, points, points), dtype=torch.float64, device=flat.device)
-        if self.discrepancy is not None:
-            covariance = self.discrepancy(at.view(count, points, at.shape[1])).transpose(0, 1)
-            if len(self.inputs):
-                cross = self.discrepancy(self.inputs, at)
-                half = torch.linalg.solve_triangular(self.cholesky, cross, upper=False)
-                draws = draws + self.whitened_residuals.transpose(1, 2) @ half
-                blocks = half.view(outputs, len(self.inputs), count, points).permute(2, 0, 1, 3)  # (B, O, n, N)
-                covariance = covariance - blocks.transpose(2, 3) @ blocks
+        at, draws = self._simulated(sets.flatten(0, 1))
+        change, covariance = self._discrepancy(at.view(count, points, -1))
+        draws = draws + change
         mean = draws.mean(dim=1)
         deviation = (draws - mean[:, None]).view(outputs, draws.shape[1], count, points).permute(2, 0, 1, 3)
         covariance = covariance + deviation.transpose(2, 3) @ deviation / draws.shape[1]
         return mean.view(outputs, count, points).transpose(0, 1).float(), covariance
+
+    def _simulated(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs of the discrepancy (F, D + O) and normalised outputs of the draws (O, P, F) at raw inputs (F, D).
+
+        Without a simulator, inputs (F, D) and one draw of zeros.
+        """
+        at = self.normaliser.inputs(inputs).double()
+        if self.model is None or self.parameters is None:
+            return at, at.new_zeros((len(self.noise_std), 1, len(inputs)))
+        draws = simulate(self.model, inputs, self.parameters, self.normaliser).permute(2, 0, 1)
+        return torch.cat([at, draws.mean(dim=1).T], dim=1), draws
+
+    def _discrepancy(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """Means given each draw (O, P, B N) and covariances (B, O, N, N) of the discrepancy at its inputs (B, N, D)."""
+        count, points, outputs = *at.shape[:2], len(self.noise_std)
+        means, covariance = at.new_zeros((outputs, 1, 1)), at.new_zeros((count, outputs, points, points))
+        if self.discrepancy is None:
+            return means, covariance
+        covariance = self.discrepancy(at).transpose(0, 1)
+        if not len(self.inputs):
+            return means, covariance
+        cross = self.discrepancy(self.inputs, at.flatten(0, 1))
+        half = torch.linalg.solve_triangular(self.cholesky, cross, upper=False)
+        blocks = half.view(outputs, len(self.inputs), count, points).permute(2, 0, 1, 3)  # (B, O, n, N)
+        return self.whitened_residuals.transpose(1, 2) @ half, covariance - blocks.transpose(2, 3) @ blocks
 
 
 def simulate(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser: Normaliser) -> Tensor:

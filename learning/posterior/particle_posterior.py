@@ -12,9 +12,12 @@ from learning.evaluation import Mixture
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.outliers import tail_scales
+from learning.posterior.particle_simulator import ParticleSimulator
 
 MIN_INPUT_CLIP = 6.0
 """Minimum clip of normalised inputs; a network's extrapolation is unbounded."""
+MAX_SIMULATED = 30.0
+"""Bound of a simulator's outputs, in units of the outputs: a draw may diverge far from the rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +34,7 @@ class ParticlePosterior:
             (1 + D, O); None: zero.
         correlation: of the noise of the normalised outputs (O, O); None: uncorrelated.
         input_clip: bounds of the normalised inputs (D,); None: ``MIN_INPUT_CLIP``.
+        simulator: its steps are added to those of the networks and the trend; None: zero.
     """
 
     network: Network
@@ -41,6 +45,7 @@ class ParticlePosterior:
     trend: Tensor | None = None
     correlation: Tensor | None = None
     input_clip: Tensor | None = None
+    simulator: ParticleSimulator | None = None
 
     @property
     def noise_scales(self) -> Tensor:
@@ -59,7 +64,7 @@ class ParticlePosterior:
         )  # fmt: skip
 
     def parameters_for(self, normaliser: Normaliser) -> Tensor:
-        """Parameters (L, P) of the same functions, without the trend, for another normaliser's output decorrelation."""
+        """Parameters (L, P) of the same networks for another normaliser's output decorrelation."""
         parameters = self.parameters.clone()
         eye = torch.eye(len(self.noise_std), dtype=torch.float64, device=parameters.device)
         own, other = (
@@ -72,8 +77,20 @@ class ParticlePosterior:
 
     def values(self, clipped: Tensor) -> Tensor:
         """Normalised outputs (L, N, O) at clipped inputs (N, D), or at inputs of each particle (L, N, D)."""
+        values = self.without_simulator(clipped)
+        return values if self.simulator is None else values + self.normaliser.outputs(self.simulated(clipped))
+
+    def without_simulator(self, clipped: Tensor) -> Tensor:
+        """The part of ``values`` of networks and trend."""
         values = self.network(self.parameters, clipped)
         return values if self.trend is None else values + self.trend[0] + clipped @ self.trend[1:]
+
+    def simulated(self, clipped: Tensor) -> Tensor:
+        """Raw outputs (L, N, O) of the simulator at clipped inputs (N, D), or at inputs of each particle (L, N, D)."""
+        assert self.simulator is not None
+        units, bound = self.normaliser, MAX_SIMULATED * self.normaliser.output_std
+        raw = self.simulator(units.raw_inputs(clipped))
+        return raw.clamp(units.output_mean - bound, units.output_mean + bound)
 
     def clipped_inputs(self, inputs: Tensor) -> Tensor:
         """Normalised and clipped inputs (N, D) of raw inputs (N, D)."""
@@ -85,8 +102,11 @@ class ParticlePosterior:
     def to(self, device: torch.device | str) -> ParticlePosterior:
         """Copy on a device."""
         required = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
-        optional = (None if v is None else v.to(device) for v in (self.trend, self.correlation, self.input_clip))
-        return ParticlePosterior(self.network, *required, self.dof, *optional)
+        trend, correlation, clip = (
+            None if v is None else v.to(device) for v in (self.trend, self.correlation, self.input_clip)
+        )
+        simulator = None if self.simulator is None else self.simulator.to(device)
+        return ParticlePosterior(self.network, *required, self.dof, trend, correlation, clip, simulator)
 
 
 def input_clip_of(inputs: Tensor) -> Tensor:

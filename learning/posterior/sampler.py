@@ -113,6 +113,8 @@ class PosteriorSampler:
         by_particle = assigned.view(particles, share, inputs.shape[1])
         values = self.posterior.network(self.parameters, by_particle)
         values += by_particle @ self.slopes
+        if self.posterior.simulator is not None:
+            values += self.posterior.simulated(by_particle)
         return values
 
 
@@ -126,12 +128,14 @@ def with_raw_outputs(posterior: ParticlePosterior, weights: Tensor, biases: Tens
 
     Returns:
         Weights and biases for raw outputs, the constant of the trend included, and the slopes (D, O) of the trend in
-        raw outputs for each normalised input.
+        raw outputs for each normalised input. The outputs of a simulator are to be added.
     """
     units, to_raw = posterior.normaliser, _to_raw(posterior)
     shape = (1 + len(units.input_mean), len(to_raw))
     trend = torch.zeros(shape).to(to_raw) if posterior.trend is None else posterior.trend.double()
-    raw_biases = (biases.double() + trend[0]) @ to_raw + units.output_mean
+    raw_biases = (biases.double() + trend[0]) @ to_raw
+    if posterior.simulator is None:
+        raw_biases = raw_biases + units.output_mean  # The simulator's raw outputs contain the mean.
     return (weights.double() @ to_raw).to(weights), raw_biases.to(biases), (trend[1:] @ to_raw).to(weights)
 
 

@@ -155,12 +155,16 @@ class CarModel:
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Changes (P, N, 6) over one step for inputs (N, D) and parameters (P, K), in ``transitions.OUTPUTS``."""
-        sets, count = len(parameters), len(inputs)
-        start = torch.cat([torch.zeros_like(inputs[:, :3]), inputs[:, :3]], dim=1)
-        commands = inputs[:, 3:].view(count, self.history + 1, 2)
-        many = [t.repeat(sets, *[1] * (t.ndim - 1)) for t in (start, commands)]
-        past = many[1][:, :-1] if self.history else None
-        states = self._roll(many[0], many[1][:, -1:], past, parameters, count)
+        return self.steps_of_draws(inputs.expand(len(parameters), *inputs.shape), parameters)
+
+    def steps_of_draws(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Changes (P, N, 6) over one step for inputs of each draw (P, N, D) and parameters (P, K)."""
+        sets, count = inputs.shape[:2]
+        rows = inputs.flatten(0, 1)
+        start = torch.cat([torch.zeros_like(rows[:, :3]), rows[:, :3]], dim=1)
+        commands = rows[:, 3:].view(len(rows), self.history + 1, 2)
+        past = commands[:, :-1] if self.history else None
+        states = self._roll(start, commands[:, -1:], past, parameters, count)
         change: Tensor = states[:, 1] - states[:, 0]
         return change.view(sets, count, 6)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,16 +24,21 @@ from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
 from learning.posterior.inference import infer
 from learning.posterior.particle_posterior import ParticlePosterior
+from learning.posterior.particle_simulator import ParticleSimulator
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, draw_parameters
 from learning.priors.simulator_model import CarModel
+from learning.priors.simulator_text import model_of, text_of
 from learning.transitions import OUTPUTS, Transitions
 from learning.world.car_dynamics import CarDynamics
 
 Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-corrected", "fsvgd"]
+Particles = Literal["network", "simulator"]
+"""What a particle is: a network, or the simulator with a draw of its parameters and a network that corrects it."""
 PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd")
 """The paper's algorithms; the others are carlab's."""
 LearnedCar = CarDynamics | WorldDynamics
-FILE_VERSION = 6
+FILE_VERSION, SIMULATOR_FILE_VERSION = 6, 7
+"""Versions of files of particles without and with a simulator; earlier programs do not read the latter."""
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
 """Prior noise of a step's changes, in the order of ``OUTPUTS``: differences of motion capture at 100 Hz."""
 PRIOR_DISCREPANCY = 0.3
@@ -48,6 +54,7 @@ _MAX_SHOWN = 6
 _UNITS = ("input_mean", "input_std", "output_mean", "output_std")
 _DOF_KEY, _DECORRELATION_KEY, _INPUT_CLIP_KEY = "freedom", "turn", "reach"
 """Names in the files of the degrees of freedom, the decorrelation of the outputs, and the bounds of the inputs."""
+_SIMULATOR_KEY, _DRAWS_KEY = "simulator", "simulator_parameters"
 _OPTIONAL_KEYS = (_DECORRELATION_KEY, "trend", "correlation", _INPUT_CLIP_KEY)
 _FRAMES = ("body", "world")
 _ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
@@ -64,6 +71,7 @@ class CarFitSettings:
         particles: their number.
         seed: of all draws.
         learning_rate: of the particles.
+        kind: what a particle is; ``simulator`` only with ``gp-sim-posterior``.
     """
 
     method: Method = "gp-sim-posterior"
@@ -71,6 +79,7 @@ class CarFitSettings:
     particles: int = 20
     seed: int = 0
     learning_rate: float = DistillationSettings().learning_rate
+    kind: Particles = "network"
 
 
 def car_units(model: CarModel, generator: torch.Generator) -> Normaliser:
@@ -138,11 +147,15 @@ def fit_car(
         model if with_simulator else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device),
         discrepancy_std=discrepancy_std, restart_scales=(1.0,), seed=settings.seed,
     )  # fmt: skip
+    correct = settings.kind == "simulator" and with_simulator
     particles = DistillationSettings(
-        particles=settings.particles, steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
-    )
+        particles=settings.particles, steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed,
+        correct_simulator=correct,
+    )  # fmt: skip
     points = measurement_points(model, inputs, units, generator, particles.domain_points)
-    start = None if earlier is None else earlier.posterior.to(device).parameters_for(target.normaliser)
+    start = None
+    if earlier is not None and (earlier.posterior.simulator is not None) == correct:
+        start = earlier.posterior.to(device).parameters_for(target.normaliser)
     return CarDynamics(distil(target, points, particles, progress, start), model.history)
 
 
@@ -187,8 +200,10 @@ def save_car_arrays(dynamics: LearnedCar, path: Path) -> None:
     content = _content(dynamics)
     means_and_stds = dict(zip(_UNITS, content.pop("units"), strict=True))
     arrays = {name: part for name, part in content.items() if isinstance(part, Tensor)} | means_and_stds
+    if content[_SIMULATOR_KEY] is not None:
+        arrays[_SIMULATOR_KEY] = torch.frombuffer(bytearray(content[_SIMULATOR_KEY].encode()), dtype=torch.uint8)
     write_arrays(path, arrays | {
-        "version": FILE_VERSION, "history": dynamics.history, "frame": _FRAMES.index(content["frame"]),
+        "version": content["version"], "history": dynamics.history, "frame": _FRAMES.index(content["frame"]),
         "activation": _ACTIVATIONS.index(content["activation"]), "network": torch.tensor(content["network"]),
         _DOF_KEY: torch.tensor(content[_DOF_KEY], dtype=torch.float64),
     })  # fmt: skip
@@ -201,6 +216,9 @@ def load_car_arrays(path: Path) -> LearnedCar:
         arrays = read_arrays(path)
         tensors = {k: torch.from_numpy(v.copy()) for k, v in arrays.items()}
         optional: dict[str, Any] = dict.fromkeys(_OPTIONAL_KEYS)
+        if _SIMULATOR_KEY in arrays:
+            optional[_SIMULATOR_KEY] = arrays[_SIMULATOR_KEY].astype(np.uint8).tobytes().decode()
+            del tensors[_SIMULATOR_KEY]
         return optional | tensors | {
             "version": whole_number(arrays, "version"), "history": whole_number(arrays, "history"),
             "frame": _FRAMES[whole_number(arrays, "frame")], "network": [int(n) for n in arrays["network"]],
@@ -219,9 +237,9 @@ def load_car_arrays(path: Path) -> LearnedCar:
 def _content(dynamics: LearnedCar) -> dict[str, Any]:
     """Content of a file."""
     posterior = dynamics.posterior.to("cpu")
-    units = posterior.normaliser
+    units, simulator = posterior.normaliser, posterior.simulator
     return {
-        "version": FILE_VERSION,
+        "version": FILE_VERSION if simulator is None else SIMULATOR_FILE_VERSION,
         "frame": "body" if isinstance(dynamics, CarDynamics) else "world",
         "history": dynamics.history,
         "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
@@ -234,6 +252,8 @@ def _content(dynamics: LearnedCar) -> dict[str, Any]:
         "trend": posterior.trend,
         "correlation": posterior.correlation,
         _INPUT_CLIP_KEY: posterior.input_clip,
+        _SIMULATOR_KEY: None if simulator is None else text_of(simulator.model),
+        _DRAWS_KEY: None if simulator is None else simulator.parameters,
     }
 
 
@@ -243,7 +263,7 @@ def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, A
     try:
         content = read()
         version = content["version"]
-        if version != FILE_VERSION:
+        if version not in (FILE_VERSION, SIMULATOR_FILE_VERSION):
             raise DataError(f"{path} has version {version}, this program reads version {FILE_VERSION}; {remedy}.")
         return _car_of(content, device)
     except DataError:
@@ -270,10 +290,28 @@ def _car_of(content: Mapping[str, Any], device: torch.device | str) -> LearnedCa
     units = Normaliser(*content["units"])
     if content[_DECORRELATION_KEY] is not None:
         units = units.decorrelated(content[_DECORRELATION_KEY])
-    optional = (content[name] for name in ("trend", "correlation", _INPUT_CLIP_KEY))
-    posterior = ParticlePosterior(network, content["parameters"], content["noise_std"], units, dof, *optional)
+    trend, correlation, input_clip = (content[name] for name in ("trend", "correlation", _INPUT_CLIP_KEY))
+    simulator = _simulator_of(content) if content["version"] == SIMULATOR_FILE_VERSION else None
+    posterior = ParticlePosterior(
+        network, content["parameters"], content["noise_std"], units, dof, trend, correlation, input_clip, simulator
+    )  # fmt: skip
     frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
     return frames[frame](posterior.to(device), history)
+
+
+def _simulator_of(content: Mapping[str, Any]) -> ParticleSimulator:
+    """The simulator of the particles of a file. Raises one of ``_READ_ERRORS`` as ``_car_of``."""
+    if content.get("frame", "body") != "body":
+        raise ValueError("a simulator of steps in the world frame")
+    model, draws = model_of(content[_SIMULATOR_KEY], content["history"]), content[_DRAWS_KEY]
+    if not isinstance(draws, Tensor) or draws.layout != torch.strided or not draws.is_floating_point():
+        raise ValueError(f"{_DRAWS_KEY} is not an array of numbers")
+    wanted = (len(content["parameters"]), model.size)
+    if tuple(draws.shape) != wanted:
+        raise ValueError(f"{_DRAWS_KEY} has shape {tuple(draws.shape)}, not {wanted}")
+    if draws.device.type != "cpu" or not torch.isfinite(draws).all():
+        raise ValueError(f"{_DRAWS_KEY} is not finite")
+    return ParticleSimulator(model, draws.float())
 
 
 def _check_sizes(network: Network, frame: str, history: int) -> None:
