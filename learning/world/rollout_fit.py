@@ -33,6 +33,7 @@ from learning.posterior.sampler import with_raw_outputs
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.drive_windows import DriveWindows, roll_out
+from learning.world.local_steps import LocalSteps
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,7 @@ def fit_rollouts(
     seed: int = 0,
     progress: Callable[[int], None] = lambda update: None,
 ) -> CarDynamics:
-    """Adjust the particles of a car to rollouts. The noise of one step does not change.
+    """Adjust the networks of a car to rollouts. The noise of one step and the particles' simulators do not change.
 
     Args:
         car: fitted with a one-step likelihood, on any device.
@@ -102,7 +103,7 @@ def fit_rollouts(
     device = car.posterior.parameters.device
     generator = torch.Generator().manual_seed(seed)
     inputs, outputs = (torch.from_numpy(v).float().to(device) for v in (rows.inputs, rows.targets))
-    problem = _Problem(car, windows.to(device), inputs, outputs, settings)
+    problem = _Problem.of(car, windows.to(device), inputs, outputs, settings)
     unit = problem.error_unit(generator)
     parameters = car.posterior.parameters.clone()
     adam = Adam(parameters)
@@ -131,9 +132,10 @@ class _Problem:
     Attributes:
         car: before the fit.
         windows: S windows.
-        inputs: of all rows (n, D), raw.
-        outputs: of all rows (n, 6), raw.
+        inputs: of all rows (n, D), normalised and clipped.
+        outputs: of all rows for each particle (L, n, 6), normalised, less those of its simulator.
         settings: of the fit.
+        simulated: steps of the particles' simulators at the windows; None: without a simulator.
     """
 
     car: CarDynamics
@@ -141,6 +143,20 @@ class _Problem:
     inputs: Tensor
     outputs: Tensor
     settings: RolloutFitSettings
+    simulated: LocalSteps | None
+
+    @classmethod
+    def of(
+        cls, car: CarDynamics, windows: DriveWindows, inputs: Tensor, outputs: Tensor, settings: RolloutFitSettings
+    ) -> _Problem:
+        """Simulate all rows and windows, for raw inputs (n, D) and outputs (n, 6)."""
+        posterior, simulated = car.posterior, None
+        clipped = posterior.clipped_inputs(inputs)
+        normalised = posterior.normaliser.outputs(outputs).expand(len(posterior.parameters), -1, -1)
+        if posterior.simulator is not None:
+            simulated = LocalSteps.of(posterior.simulator, windows)
+            normalised = normalised - posterior.normaliser.outputs(posterior.simulated(clipped))
+        return cls(car, windows, clipped, normalised, settings, simulated)
 
     def error_unit(self, generator: torch.Generator) -> Tensor:
         """Robust standard deviation (K, 6) of the errors before the fit: scaled median absolute deviation."""
@@ -187,8 +203,8 @@ class _Problem:
     def _one_step_loss(self, functions: _Functions, batch: Tensor) -> Tensor:
         """Sum over particles of the loss of their steps at rows (L, m)."""
         posterior = self.car.posterior
-        values = functions.normalised(posterior.clipped_inputs(self.inputs[batch]))
-        error = (values - posterior.normaliser.outputs(self.outputs[batch])) / posterior.noise_std
+        particle = torch.arange(len(batch), device=batch.device)[:, None]
+        error = (functions.normalised(self.inputs[batch]) - self.outputs[particle, batch]) / posterior.noise_std
         return _huber(error, self.settings.one_step_huber).mean(dim=(1, 2)).sum()
 
     def _anchor_loss(self, functions: _Functions, chosen: Tensor, generator: torch.Generator) -> Tensor:
@@ -197,7 +213,7 @@ class _Problem:
         offset = self.settings.anchor_distance * torch.randn(inputs.shape, generator=generator)
         clipped = posterior.clipped_inputs(inputs + offset.to(inputs) * posterior.normaliser.input_std)
         with torch.no_grad():
-            before = posterior.values(clipped)
+            before = posterior.without_simulator(clipped)
         return ((functions.normalised(clipped) - before) ** 2).mean(dim=(1, 2)).sum()
 
     def _paths(self, functions: _Functions, chosen: Tensor) -> Tensor:
@@ -205,8 +221,11 @@ class _Problem:
         particles, count = chosen.shape
 
         def change(inputs: Tensor, step: int) -> Tensor:
-            clipped = self.car.posterior.clipped_inputs(inputs.view(particles, count, -1))
-            return functions.raw(clipped).flatten(0, 1)
+            by_particle = inputs.view(particles, count, -1)
+            changes = functions.raw(self.car.posterior.clipped_inputs(by_particle))
+            if self.simulated is not None:
+                changes = changes + self.simulated(chosen, step, by_particle[..., :3])
+            return changes.flatten(0, 1)
 
         paths = roll_out(self.windows.take(chosen.flatten()), change)
         return paths.view(particles, count, *paths.shape[1:])
@@ -214,7 +233,7 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True)
 class _Functions:
-    """The functions of L particles with other parameters.
+    """The networks and the trend of L particles with other parameters.
 
     Attributes:
         posterior: units and trend.
