@@ -26,6 +26,7 @@ RAY_WAIT_S = LinkSettings().wait_s
 BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
 Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-corrected", "fsvgd"]
 Device = Literal["cpu", "cuda"]
+Particles = Literal["network", "simulator"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +53,7 @@ class LearnRequest:
     ticks: int | None = None
     prior: str | Path | CarFile = "kinematic"
     method: Method = "gp-sim-posterior"
+    particles: Particles = "network"
     history: int | None = None
     model_steps: int | None = None
     updates: int = 30000
@@ -98,7 +100,7 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
     text = tomli_w.dumps(_prior(request, choice).to_tables())
     return TrainingPlan(
         text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
-        device=request.device or "cpu", task_choice=task_choice,
+        device=request.device or "cpu", task_choice=task_choice, particles=request.particles,
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from carlab.api.learn_request import (
     Device,
     LearnRequest,
     Method,
+    Particles,
     checked_simulator,
     learn_request,
     training_plan,
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from carlab.recording.run_folder import RunDirectory
 
 EPISODES = 20
-PLAN_ARGUMENTS = ("method", "history", "model_steps", "updates", "seed", "ticks")
+PLAN_ARGUMENTS = ("method", "particles", "history", "model_steps", "updates", "seed", "ticks")
 """Arguments that are part of the training plan of a run."""
 
 
@@ -118,9 +119,10 @@ class LearnRun:
 def learn(
     car: str | Path | CarFile = "sim", *, task: str | Task | None = None, track: Path | str | None = None,
     episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile | None = None,
-    method: Method | None = None, history: int | None = None, model_steps: int | None = None,
-    updates: int | None = None, seed: int | None = None, device: Device | None = None, place: bool | None = None,
-    resume: Path | str | None = None, out: Path | str | None = None, name: str | None = None, rerun: bool | None = None,
+    method: Method | None = None, particles: Particles | None = None, history: int | None = None,
+    model_steps: int | None = None, updates: int | None = None, seed: int | None = None, device: Device | None = None,
+    place: bool | None = None, resume: Path | str | None = None, out: Path | str | None = None,
+    name: str | None = None, rerun: bool | None = None,
     live: bool = False, viewer: str | None = None, vehicle: str | Path | CarFile | None = None,
     reality: str | Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
     hooks: RunHooks | None = None,
@@ -139,6 +141,9 @@ def learn(
         method: ``gp-sim-posterior`` (the default): particles of a Gaussian-process posterior around the simulator
             (carlab's own method). ``gp-posterior``: the same without a simulator. ``sim-fsvgd``: the paper's, as in the
             authors' code; ``sim-fsvgd-corrected``: without its errors; ``fsvgd``: the paper's, without a simulator.
+        particles: ``network`` (the default): each particle is a network that predicts a step. ``simulator``: each
+            particle is the prior simulator with its own parameters and a network that corrects its steps; with
+            ``gp-sim-posterior`` only, and slower.
         history: number of past commands that model and policy observe. By default it covers the command delay, the
             latency of motion capture and the window of the velocity estimate (4 for the simulated car; the paper's
             methods have 3). After three episodes a message states the number that the recordings support.
@@ -285,6 +290,12 @@ def _check(request: LearnRequest) -> None:
         available(request.device or "cpu")
     if request.method not in get_args(Method):
         raise ConfigError(f"--method {request.method}: choose one of {', '.join(get_args(Method))}.")
+    if request.particles not in get_args(Particles):
+        raise ConfigError(f"--particles {request.particles}: choose one of {', '.join(get_args(Particles))}.")
+    if request.particles == "simulator" and request.method != "gp-sim-posterior":
+        raise ConfigError(
+            f"--particles simulator corrects the simulator of --method gp-sim-posterior; {request.method} has none."
+        )
     if request.prior == AUTO and request.method != "gp-sim-posterior":
         raise ConfigError(
             f"--prior auto: its corrections are for --method gp-sim-posterior; {request.method} needs another --prior."

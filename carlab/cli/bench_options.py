@@ -91,6 +91,10 @@ class BenchOptions:
     """rollouts with --rows all: the prior simulator has measured curves (drive force, steering, tyres), which are
     fitted to the recordings to fit; each fold of the cross-validation has its own."""
 
+    particles: Literal["network", "simulator"] = "network"
+    """rollouts: what each particle of a car is. network: a network that predicts a step. simulator: the prior simulator
+    with its own parameters, and a network that corrects its steps."""
+
     keep_events: bool = False
     """realcars: also fit and score prediction windows with events (collisions, a hand that moves the car)."""
 
@@ -157,6 +161,7 @@ STUDIES_OF_OPTION = {
     "held_out": (REALCARS,),
     "effects": (REALCARS,),
     "curves": (ROLLOUTS,),
+    "particles": (ROLLOUTS,),
     "keep_events": (REALCARS,),
     "fit": (REALCARS,),
     "car": (REALCAR, READ, REALCARS, ROLLOUTS),

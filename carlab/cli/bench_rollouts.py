@@ -36,7 +36,8 @@ def run_rollouts(options: BenchOptions) -> int:
     scores, stopped = run_study_parts(
         lambda progress, stop: run_rollout_study(
             case, recordings, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
-            steps=options.steps, device=options.device, curves_from=curves_from, progress=progress, stop=stop,
+            steps=options.steps, device=options.device, curves_from=curves_from,
+            correct_simulator=options.particles == "simulator", progress=progress, stop=stop,
         ),
         lambda: _jobs(options, case, recordings, files, failures),
         options,
@@ -57,6 +58,7 @@ def _jobs(
     """One job for each number of rows and seed; ``failures`` receives the messages of failed ones."""
     more, contents = recorded_files(files, options.car, case.rows.history)
     more += ["--curves"] if options.curves else []
+    more += ["--particles", options.particles]
 
     def job(rows: Rows, seed: int) -> StudyJob[RolloutScore]:
         command = bench_job(options, rows, seed, more, contents)

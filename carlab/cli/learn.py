@@ -13,7 +13,7 @@ from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes, arg
 
 from carlab.api.driving import drive
-from carlab.api.learn_request import RAY_WAIT_S, Device, Method
+from carlab.api.learn_request import RAY_WAIT_S, Device, Method, Particles
 from carlab.api.learning import LearnRun, learn
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, progress, table
@@ -77,6 +77,7 @@ class Learn:
     lie within 30 % of their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
 
     method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = ARGUMENT_DEFAULT
+    particles: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Particles)) + "}")] = ARGUMENT_DEFAULT
     history: int | None = ARGUMENT_DEFAULT
     model_steps: int | None = ARGUMENT_DEFAULT
     updates: int | None = ARGUMENT_DEFAULT

@@ -87,6 +87,21 @@ class RolloutScore:
     all_rows: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """Settings of the fit of a car.
+
+    Attributes:
+        steps: of the particles' optimiser; None: those of the regression study.
+        device: of the fit.
+        correct_simulator: whether particles are networks that correct the simulator, instead of networks alone.
+    """
+
+    steps: int | None = None
+    device: str = "cpu"
+    correct_simulator: bool = False
+
+
 def run_rollout_study(
     case: RecordedCase,
     recordings: Sequence[Sequence[EpisodeData]],
@@ -97,6 +112,7 @@ def run_rollout_study(
     steps: int | None = None,
     device: str = "cpu",
     curves_from: SimulatorConfig | None = None,
+    correct_simulator: bool = False,
     progress: Progress = lambda what, done, total: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[RolloutScore]:
@@ -112,6 +128,7 @@ def run_rollout_study(
         device: of the fits; rollouts are sampled on the CPU.
         curves_from: simulator of the car file, to which measured curves are added as the prior; None: no curves. The
             curves of a fold are fitted without its blocks.
+        correct_simulator: whether particles are networks that correct the simulator, instead of networks alone.
         progress: called before each fit.
         stop: if it returns true before a fit, the study ends.
 
@@ -122,7 +139,8 @@ def run_rollout_study(
     counts = checked_counts(case, recordings, rows, with_curves=curves_from is not None)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
     fit_windows, held_out = (recorded_windows(of, max(HORIZONS_S), STRIDE_S) for of in (fitted, recordings[-1]))
-    fit = _fit_without_fold(case, fitted, curves_from, steps, device)
+    fit_settings = FitSettings(steps, device, correct_simulator)
+    fit = _fit_without_fold(case, fitted, curves_from, fit_settings)
     total = len(counts) * seeds * (N_FOLDS + 1)
     for done, (count, seed) in enumerate(itertools.product(counts, range(first_seed, first_seed + seeds))):
         errors: list[RolloutErrors] = []
@@ -142,8 +160,7 @@ def _fit_without_fold(
     case: RecordedCase,
     episodes: Sequence[EpisodeData],
     curves_from: SimulatorConfig | None,
-    steps: int | None,
-    device: str,
+    settings: FitSettings,
 ) -> Callable[[Rows, int, int | None], CarDynamics]:
     """A fit to a number of rows of the episodes with a seed, without the blocks of a fold (None: to all blocks).
 
@@ -159,8 +176,8 @@ def _fit_without_fold(
     def fit(count: Rows, seed: int, held_out_fold: int | None) -> CarDynamics:
         rows, windows = _without_fold(case, dense_windows, fold_of_row, held_out_fold)
         if count == ALL_ROWS:
-            return fit_all(case_of(held_out_fold), rows, windows, seed, steps, device)
-        return fit_rows(case, rows, count, seed, steps, device)
+            return fit_all(case_of(held_out_fold), rows, windows, seed, settings)
+        return fit_rows(case, rows, count, seed, settings)
 
     return fit
 
@@ -230,22 +247,24 @@ def folds_of_rows(rows: Transitions, episodes: Sequence[EpisodeData]) -> np.ndar
 
 
 def fit_rows(
-    case: RecordedCase, rows: Transitions, count: int, seed: int, steps: int | None = None, device: str = "cpu"
+    case: RecordedCase, rows: Transitions, count: int, seed: int, settings: FitSettings | None = None
 ) -> CarDynamics:
     """Fit ``gp-sim-posterior`` of the regression study to ``count`` random rows; the car is on the CPU."""
+    settings = settings or FitSettings()
     chosen = rows.take(np.random.default_rng(seed).choice(len(rows), count, replace=False))
-    inputs, outputs = (torch.from_numpy(v).float().to(device) for v in (chosen.inputs, chosen.targets))
-    task = FitTask(case, Data(inputs, outputs, inputs, outputs), seed, steps)
+    inputs, outputs = (torch.from_numpy(v).float().to(settings.device) for v in (chosen.inputs, chosen.targets))
+    task = FitTask(case, Data(inputs, outputs, inputs, outputs), seed, settings.steps)
     size = case.prior_discrepancy_for(count)
-    return CarDynamics(task.distilled(case.prior, outputs, size).posterior.to("cpu"), rows.history)
+    particles = task.distilled(case.prior, outputs, size, correct_simulator=settings.correct_simulator)
+    return CarDynamics(particles.posterior.to("cpu"), rows.history)
 
 
 def fit_all(
-    case: RecordedCase, rows: Transitions, windows: PredictionWindows, seed: int, steps: int | None, device: str
+    case: RecordedCase, rows: Transitions, windows: PredictionWindows, seed: int, settings: FitSettings
 ) -> CarDynamics:
     """Fit to ``ONE_STEP_ROWS`` random rows, then to rollouts over windows and to all rows; the car is on the CPU."""
-    start = fit_rows(case, rows, min(ONE_STEP_ROWS, len(rows)), seed, steps, device)
-    start = CarDynamics(start.posterior.to(device), start.history)
+    start = fit_rows(case, rows, min(ONE_STEP_ROWS, len(rows)), seed, settings)
+    start = CarDynamics(start.posterior.to(settings.device), start.history)
     car = fit_rollouts(start, drive_windows(windows, start.history), rows, seed=seed)
     return CarDynamics(car.posterior.to("cpu"), car.history)
 

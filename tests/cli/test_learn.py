@@ -86,6 +86,10 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
             "--prior auto --method fsvgd",
             "--prior auto: its corrections are for --method gp-sim-posterior; fsvgd needs another --prior.",
         ),
+        (
+            "--particles simulator --method fsvgd",
+            "--particles simulator corrects the simulator of --method gp-sim-posterior; fsvgd has none.",
+        ),
         ("--updates -5", "--updates -5: give a number above zero."),
         ("--model-steps 0", "--model-steps 0: give a number above zero."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),

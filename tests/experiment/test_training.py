@@ -66,6 +66,18 @@ def test_model_uses_the_velocity_delay_of_the_recordings(tmp_path: Path, monkeyp
     )
 
 
+def test_particles_of_the_plan_correct_the_prior_simulator(tmp_path: Path) -> None:
+    """In two trainings, of which the second continues with the networks of the first and fits rollouts."""
+    plan = replace(tiny_plan(choose_car("sim"), model_steps=20, updates=8), particles="simulator")
+    recordings, models = drive(tmp_path, TICKS).recordings(), tmp_path / "models"
+    for count in (0, 1):
+        train(plan, models, recordings[:count], ENVELOPE, lambda *what: None)
+        car = car_fit.load_car(training.model_folder(models, count + 1) / training.DYNAMICS_FILE)
+        assert car.posterior.simulator is not None
+        assert car.posterior.simulator.model.config.kind == "kinematic"
+        assert len(car.posterior.simulator.parameters) == len(car.posterior.parameters)
+
+
 def test_history_length_is_selected_after_three_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     episode_counts: list[int] = []
 

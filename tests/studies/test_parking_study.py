@@ -132,6 +132,16 @@ def test_earlier_names_of_methods_are_read_with_their_current_names(caplog: pyte
     assert plan_from_json(renamed).method == "sim-fsvgd-corrected"
 
 
+def test_plan_has_the_kind_of_the_particles() -> None:
+    """Plans of earlier programs have networks."""
+    plan = TrainingPlan("", particles="simulator")
+    content = plan_as_json(plan)
+    assert plan_from_json(content) == plan
+    assert plan_from_json({k: v for k, v in content.items() if k != "particles"}).particles == "network"
+    with pytest.raises(ValueError, match="particles of the plan"):
+        plan_from_json({**content, "particles": "other"})
+
+
 def test_folder_and_options_with_the_former_name_of_a_method_are_found(tmp_path: Path) -> None:
     folder = write_run(tmp_path, "sim-fsvgd-mended", 0, [1.0], set())
     assert run_folder(tmp_path, "sim-fsvgd-corrected", 0) == folder

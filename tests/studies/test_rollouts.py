@@ -69,6 +69,23 @@ def test_study_prints_calibrated_bands_of_a_wrong_model(
     assert f"{rms[DISTURBED]:.3f}" in capsys.readouterr().out
 
 
+def test_particles_of_the_study_are_those_of_the_option(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = []
+
+    def fit(case: object, rows: Transitions, count: int, seed: int, settings: study.FitSettings) -> CarDynamics:
+        kinds.append(settings.correct_simulator)
+        return linear_car(case, rows, count, seed)
+
+    monkeypatch.setattr(study, "fit_rows", fit)
+    monkeypatch.setattr(study, "fit_disturbance", lambda errors: DisturbanceProcess((0.5,) * 3, (0.4,) * 3, PERIOD_S))
+    monkeypatch.setattr(study, "N_SAMPLES", 20)
+    command = ["bench", "rollouts", "--data", str(folder), "--rows", "200", "--seeds", "1", "--history", "3"]
+    for option, expected in (([], False), (["--particles", "simulator"], True)):
+        kinds.clear()
+        assert run([*command, "--car", "rc_car", *option]) == 0
+        assert kinds == [expected] * 4
+
+
 def test_fit_to_all_rows_has_the_windows_of_its_rows(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -299,7 +299,7 @@ def _fitted(
             simulator,
             plan.method == "sim-fsvgd-corrected",
         )
-    settings = CarFitSettings(plan.method, steps, seed=seed)
+    settings = CarFitSettings(plan.method, steps, seed=seed, kind=plan.particles)
     earlier = before if isinstance(before, CarDynamics) else None
 
     def fitted(rate_factor: float) -> LearnedCar:

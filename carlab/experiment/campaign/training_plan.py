@@ -13,7 +13,7 @@ from carlab.core.task import Task
 from carlab.core.task_choice import PARKING, TaskChoice
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
-from learning.world.car_fit import Method
+from learning.world.car_fit import Method, Particles
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -35,6 +35,7 @@ class TrainingPlan:
         history: number of past commands that model and policy observe.
         method: ``gp-sim-posterior`` has a simulator prior, ``gp-posterior`` has none; ``sim-fsvgd``,
             ``sim-fsvgd-corrected`` and ``fsvgd`` are the paper's, with its settings.
+        particles: ``network``, or ``simulator`` for networks that correct the steps of the prior simulator.
         model_steps: steps of the particles' optimiser; None: the default of the method.
         updates: gradient steps of SAC (``updates_before``).
         ticks: ticks of an episode; None: those of the task.
@@ -54,6 +55,7 @@ class TrainingPlan:
     threads: int = 1
     device: str = "cpu"
     task_choice: TaskChoice = PARKING
+    particles: Particles = "network"
 
     @property
     def task(self) -> Task:
@@ -101,8 +103,9 @@ def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
         log.warning("The run's method '%s' is now called '%s'.", content["method"], method)
     values = {k: v for k, v in content.items() if k != "version"}
     plan = TrainingPlan(**{**values, "method": method, "task_choice": task_choice})
-    if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
-        raise ValueError("prior, method or device of the plan")
+    choices = ((plan.method, get_args(Method)), (plan.device, ("cpu", "cuda")), (plan.particles, get_args(Particles)))
+    if not isinstance(plan.prior_toml, str) or any(value not in allowed for value, allowed in choices):
+        raise ValueError("prior, method, device or particles of the plan")
     for name, minimum in MIN_VALUES.items():
         value = getattr(plan, name)
         if value is None and name in ("model_steps", "ticks"):

@@ -140,8 +140,12 @@ class FitTask:
             with_discrepancy=size is not None, noise_known=not self.case.fit_noise, seed=self.seed,
         )  # fmt: skip
 
-    def distilled(self, simulator: DomainModel | None, outputs: Tensor, size: Size) -> SmoothedParticles:
+    def distilled(
+        self, simulator: DomainModel | None, outputs: Tensor, size: Size, *, correct_simulator: bool = False
+    ) -> SmoothedParticles:
         """Particles distilled from the posterior over functions at the rows, with outputs (n, O); as ``posterior``.
+
+        With ``correct_simulator`` they are networks that correct the simulator.
 
         Raises:
             DataError: numbers are missing or infinite, or the simulator gives no finite outputs.
@@ -149,7 +153,9 @@ class FitTask:
         """
         generator = torch.Generator().manual_seed(30_000 + self.seed)
         posterior = self.posterior(simulator, self.data.inputs, outputs, size)
-        settings = DistillationSettings(hidden=HIDDEN, steps=self.steps or STEPS, seed=self.seed)
+        settings = DistillationSettings(
+            hidden=HIDDEN, steps=self.steps or STEPS, seed=self.seed, correct_simulator=correct_simulator
+        )
         points = measurement_points(
             simulator or self.case.prior, self.data.inputs, self.normaliser, generator, settings.domain_points
         )
