@@ -121,11 +121,10 @@ def learn(
     episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile | None = None,
     method: Method | None = None, particles: Particles | None = None, history: int | None = None,
     model_steps: int | None = None, updates: int | None = None, seed: int | None = None, device: Device | None = None,
-    place: bool | None = None, resume: Path | str | None = None, out: Path | str | None = None,
-    name: str | None = None, rerun: bool | None = None,
-    live: bool = False, viewer: str | None = None, vehicle: str | Path | CarFile | None = None,
-    reality: str | Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
-    hooks: RunHooks | None = None,
+    place: bool | None = None, resume: Path | str | None = None, out: Path | str | None = None, name: str | None = None,
+    rerun: bool | None = None, live: bool = False, viewer: str | None = None,
+    vehicle: str | Path | CarFile | None = None, reality: str | Path | CarFile | None = None, dry_run: bool = False,
+    ray: str = "", ray_wait: float = RAY_WAIT_S, hooks: RunHooks | None = None,
 ) -> LearnRun:  # fmt: skip
     """Fit a model of the car (the learned car), train a policy in it, drive an episode with the policy, and repeat.
 
@@ -141,14 +140,11 @@ def learn(
         method: ``gp-sim-posterior`` (the default): particles of a Gaussian-process posterior around the simulator
             (carlab's own method). ``gp-posterior``: the same without a simulator. ``sim-fsvgd``: the paper's, as in the
             authors' code; ``sim-fsvgd-corrected``: without its errors; ``fsvgd``: the paper's, without a simulator.
-        particles: ``network`` (the default): each particle is a network that predicts a step. ``simulator``: each
-            particle is the prior simulator with its own parameters and a network that corrects its steps; with
-            ``gp-sim-posterior`` only, and slower.
+        particles: ``network`` (the default), or ``simulator``: networks that correct the steps of the prior simulator.
         history: number of past commands that model and policy observe. By default it covers the command delay, the
             latency of motion capture and the window of the velocity estimate (4 for the simulated car; the paper's
             methods have 3). After three episodes a message states the number that the recordings support.
-        model_steps: optimiser steps of the model before an episode, 2500 by default (the paper's methods: up to 40
-            000).
+        model_steps: optimiser steps of the model before an episode: 2500; of the paper's methods at most 40 000.
         updates: gradient steps of SAC before an episode, 30 000 by default. Before the first episode the number is 1.5
             times as large; after the third it is multiplied by 3 / episode.
         seed: seed of all random numbers, 0 by default. The same seed gives the same run, except for a resumed run (its
