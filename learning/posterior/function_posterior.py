@@ -102,7 +102,7 @@ class FunctionPosterior:
         batches = []
         for part in torch.split(sets, max(_MAX_BATCH_POINTS // sets.shape[1], 1)):
             at, simulated = self._simulated(part.flatten(0, 1))
-            change, covariance = self._discrepancy(at.view(*part.shape[:2], -1))
+            change, covariance = self._discrepancy(at.view(*part.shape[:2], at.shape[1]))
             change = change.expand_as(simulated)[:, draws]
             by_set = change.reshape(*change.shape[:2], *part.shape[:2])
             batches.append((by_set.permute(1, 2, 0, 3).float(), covariance))
@@ -112,7 +112,7 @@ class FunctionPosterior:
         count, points = sets.shape[:2]
         outputs = len(self.noise_std)
         at, draws = self._simulated(sets.flatten(0, 1))
-        change, covariance = self._discrepancy(at.view(count, points, -1))
+        change, covariance = self._discrepancy(at.view(count, points, at.shape[1]))
         draws = draws + change
         mean = draws.mean(dim=1)
         deviation = (draws - mean[:, None]).view(outputs, draws.shape[1], count, points).permute(2, 0, 1, 3)

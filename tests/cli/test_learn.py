@@ -24,6 +24,7 @@ import carlab.cars as carlab_cars
 from carlab.api import learning
 from carlab.cli import run
 from carlab.cli.options import CarOptions
+from carlab.experiment.campaign.training import TrainingRequest
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
 
@@ -323,10 +324,10 @@ def test_resumed_run_keeps_its_seed_and_all_results(
     assert seeds == [7]
 
 
-def interrupted(plan: Any, models: Path, recordings: list[Path], *others: Any) -> dict[str, Any] | None:
+def interrupted(request: TrainingRequest, progress: Any, stop: Callable[[], bool]) -> dict[str, Any] | None:
     """A training during which the user presses ^C."""
     signal.raise_signal(signal.SIGINT)
-    assert others[-1](), "the training sees the stop request"
+    assert stop(), "the training sees the stop request"
     return None
 
 

@@ -71,7 +71,7 @@ def test_particles_of_the_plan_correct_the_prior_simulator(tmp_path: Path) -> No
     plan = replace(tiny_plan(choose_car("sim"), model_steps=20, updates=8), particles="simulator")
     recordings, models = drive(tmp_path, TICKS).recordings(), tmp_path / "models"
     for count in (0, 1):
-        train(plan, models, recordings[:count], ENVELOPE, lambda *what: None)
+        train(TrainingRequest(plan, models, recordings[:count], ENVELOPE), lambda *what: None)
         car = car_fit.load_car(training.model_folder(models, count + 1) / training.DYNAMICS_FILE)
         assert car.posterior.simulator is not None
         assert car.posterior.simulator.model.config.kind == "kinematic"
