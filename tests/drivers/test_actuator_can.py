@@ -34,6 +34,8 @@ from drivers.sender.process import SenderThread
 from drivers.vesc.can_device import VescCanDevice
 from tests.helpers.waiting import TIMEOUT_S, until
 
+pytestmark = pytest.mark.realtime
+
 ROOT = Path(__file__).resolve().parents[2]
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)

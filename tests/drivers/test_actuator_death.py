@@ -21,6 +21,8 @@ from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.sender.process import SenderProcess
 from tests.helpers.waiting import TIMEOUT_S, until
 
+pytestmark = pytest.mark.realtime
+
 ROOT = Path(__file__).resolve().parents[2]
 MOTOR_TIMEOUT_S = 0.4
 

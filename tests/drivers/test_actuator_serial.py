@@ -33,6 +33,8 @@ from drivers.vesc.serial_codec import encode_frame
 from tests.helpers.pauses import RunningTime
 from tests.helpers.waiting import TIMEOUT_S, until
 
+pytestmark = pytest.mark.realtime
+
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)  # 3 A, servo 0.65
 

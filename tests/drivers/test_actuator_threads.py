@@ -16,6 +16,8 @@ from drivers.config import ActuatorConfig
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.sender.logic import SenderState
 
+pytestmark = pytest.mark.realtime
+
 MOVING = Action(0.5, 0.3)
 TIMEOUT_S = 20.0
 

@@ -26,6 +26,8 @@ from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.links.bus_lock import BusLock
 from drivers.links.can_link import CanLink
 
+pytestmark = pytest.mark.realtime
+
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 20.0
 CHANNEL = f"test-{uuid.uuid4()}"

@@ -30,6 +30,8 @@ from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.hardware_car import HardwareCar
 from drivers.vesc.payloads import MotorValues
 
+pytestmark = pytest.mark.realtime
+
 
 class ScriptedPoses:
     """A pose source with samples scripted by the test."""

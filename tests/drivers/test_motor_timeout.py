@@ -19,6 +19,8 @@ from drivers.vesc.payloads import FirmwareVersion, MotorValues
 from tests.helpers.pauses import RunningTime
 from tests.helpers.waiting import TIMEOUT_S, until
 
+pytestmark = pytest.mark.realtime
+
 MOVING = Action(0.5, 0.3)
 CALIBRATION = ActuatorCalibration()
 CONTROLLED, RELEASED = (MotorValues(erpm=0.0, fault_code=0, status_bits=bits) for bits in (0, 1))

@@ -19,6 +19,8 @@ from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.sender.process import SenderProcess
 from tests.helpers.waiting import until
 
+pytestmark = pytest.mark.realtime
+
 MOVING = Action(0.5, 0.3)  # 3 A
 
 

@@ -32,6 +32,8 @@ from drivers.sender.loop import RECONNECT_PERIODS_S
 from tests.helpers.pauses import RunningTime
 from tests.helpers.waiting import until
 
+pytestmark = pytest.mark.realtime
+
 MOVING = Action(0.5, 0.3)
 
 
