@@ -45,10 +45,10 @@ class CarCheck:
 
     def _repr_html_(self) -> str:
         parts = [] if self.latency is None else self.latency.rows()
-        notes = [["problem", text] for text in self.problems] + [["warning", text] for text in self.health.warnings]
-        ready = html_table(["ready", "yes" if self.is_ready else "no"], notes)
+        lines = [["ready", "yes" if self.is_ready else "no"]]
+        lines += [["problem", text] for text in self.problems] + [["warning", text] for text in self.health.warnings]
         return (
-            ready
+            html_table(["check", "result"], lines)
             + html_table(["reading", "value"], [[*item] for item in self.health.readings.items()])
             + html_table(["latency [ms]", "p50", "p99", "max", "samples"], parts)
         )

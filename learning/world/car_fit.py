@@ -264,7 +264,8 @@ def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, A
         content = read()
         version = content["version"]
         if version not in (FILE_VERSION, SIMULATOR_FILE_VERSION):
-            raise DataError(f"{path} has version {version}, this program reads version {FILE_VERSION}; {remedy}.")
+            known = f"{FILE_VERSION} and {SIMULATOR_FILE_VERSION}"
+            raise DataError(f"{path} has version {version}, this program reads versions {known}; {remedy}.")
         return _car_of(content, device)
     except DataError:
         raise

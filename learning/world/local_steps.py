@@ -25,6 +25,7 @@ DESIGN_RADIUS = 1.7
 DESIGN_POINTS = 40
 """Simulated deviations of each row; a polynomial has 20 coefficients."""
 ROWS_AT_ONCE = 2000
+"""Recorded rows whose deviations are simulated in one batch, which bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)

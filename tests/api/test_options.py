@@ -3,10 +3,12 @@
 import dataclasses
 import inspect
 import math
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import tyro
 
 import carlab
 from carlab.api.recordings import CHANNEL_OPTIONS, RENAMED_OPTIONS
@@ -156,3 +158,16 @@ def test_invalid_options_of_a_csv_are_refused(options: dict[str, object], messag
 def test_horizon_of_a_prediction_is_a_finite_number_above_zero(horizon_s: object) -> None:
     with pytest.raises(ConfigError, match="must be finite numbers above zero"):
         score_recording([], SimulatorConfig(), horizon_s=horizon_s)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        CarOptions(),
+        CarOptions("emulated"),
+        CarOptions("my car.toml", dry_run=True),
+        CarOptions("sim", Path("a b.toml")),
+    ],
+)
+def test_printed_car_options_parse_to_the_same_options(options: CarOptions) -> None:
+    assert tyro.cli(CarOptions, args=shlex.split(options.to_text())) == options

@@ -7,7 +7,6 @@ import functools
 import io
 import json
 import math
-import shlex
 import shutil
 import signal
 from collections.abc import Callable
@@ -18,12 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import tyro
 
 import carlab.cars as carlab_cars
 from carlab.api import learning
 from carlab.cli import run
-from carlab.cli.options import CarOptions
 from carlab.experiment.campaign.training import TrainingRequest
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -358,19 +355,6 @@ def test_training_on_ray_gives_the_run_without_ray(
             assert all(np.array_equal(found[key], expected[key]) for key in expected)
         one, other = (read_episode(path / "episodes" / f"{name}.mcap") for path in (folder, learned[2]))
         np.testing.assert_array_equal(one.states, other.states)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        CarOptions(),
-        CarOptions("emulated"),
-        CarOptions("my car.toml", dry_run=True),
-        CarOptions("sim", Path("a b.toml")),
-    ],
-)
-def test_printed_car_options_parse_to_the_same_options(options: CarOptions) -> None:
-    assert tyro.cli(CarOptions, args=shlex.split(options.to_text())) == options
 
 
 def test_resume_command_is_printed_only_if_the_run_folder_exists(
