@@ -15,6 +15,8 @@ import can
 class SlcanAdapter:
     """It forwards frames in both directions and acknowledges each line, like the firmware of such adapters.
 
+    As there, frames of the bus arrive at the host between the commands ``O`` and ``C``.
+
     ``link`` is a symbolic link to the port, so that the port has the same name after ``plug``.
     """
 
@@ -43,6 +45,7 @@ class SlcanAdapter:
         if self._link is not None:
             self._link.symlink_to(self._name)
         self._stop = threading.Event()
+        self._is_on_the_bus = False
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -73,12 +76,16 @@ class SlcanAdapter:
                 *lines, pending = (pending + os.read(self._master, 4096)).split(b"\r")
                 for line in lines:
                     self._execute(line)
-            message = self._bus.recv(0.001)
-            if message is not None:
-                self.send(f"T{message.arbitration_id:08X}{message.dlc}{message.data.hex().upper()}\r".encode())
+            wait_s = 0.001
+            while (message := self._bus.recv(wait_s)) is not None:  # all of them: a busy machine loops rarely
+                wait_s = 0.0
+                if self._is_on_the_bus:
+                    self.send(f"T{message.arbitration_id:08X}{message.dlc}{message.data.hex().upper()}\r".encode())
 
     def _execute(self, line: bytes) -> None:
         self.lines.append(line)
+        if line in (b"O", b"C"):
+            self._is_on_the_bus = line == b"O"
         if line.startswith(b"T"):
             data = bytes.fromhex(line[10:].decode())
             self._bus.send(can.Message(arbitration_id=int(line[1:9], 16), data=data, is_extended_id=True))
