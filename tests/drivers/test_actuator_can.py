@@ -246,11 +246,14 @@ def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, vict
     assert firmware.stdout is not None
     assert "id 23" in firmware.stdout.readline()
     main = subprocess.Popen(
-        [sys.executable, "-c", CHILD, channel], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        [sys.executable, "-c", CHILD, channel], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
         assert main.stdout is not None
-        sender_pid = int(main.stdout.readline())
+        assert main.stderr is not None
+        line = main.stdout.readline()
+        assert line, main.stderr.read()
+        sender_pid = int(line)
         until(lambda: any(e.value == 3.0 for e in read_log(log)))
         os.kill(main.pid if victim == "main" else sender_pid, signal.SIGKILL)
         main.communicate(timeout=TIMEOUT_S)

@@ -52,8 +52,10 @@ def test_recorded_command_equals_the_command_received_by_the_firmware(
     times_s, values = np.array([e.t_s for e in currents]), np.array([e.value for e in currents])
     # The last current received before the next tick; on a busy machine some commands arrive later.
     last_currents = values[np.searchsorted(times_s, episode.times_s[rows.tick + 1]) - 1]
-    current_per_throttle = last_currents / rows.inputs[:, -1]
-    assert np.mean(np.abs(current_per_throttle / np.median(current_per_throttle) - 1.0) < 0.01) > 0.7
+    throttles = rows.inputs[:, -1]
+    is_moving = throttles != 0.0  # neutral while the telemetry was stale; such a row counts as different
+    per_throttle = last_currents[is_moving] / throttles[is_moving]
+    assert np.sum(np.abs(per_throttle / np.median(per_throttle) - 1.0) < 0.01) > 0.7 * len(rows)
 
 
 def test_training_and_driving_do_not_overlap(tmp_path: Path) -> None:
