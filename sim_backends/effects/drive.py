@@ -133,6 +133,11 @@ def limited_force(ops: Ops, force: Value, limit: Value, roundness: Value) -> Val
     return 2.0 * force * limit / (size + limit + root)
 
 
+def _finite(ops: Ops, force: Value) -> Value:
+    """A limit [N], at most ``MAX_FORCE_N``: an infinite one gives no finite force."""
+    return ops.where(force < MAX_FORCE_N, force, MAX_FORCE_N)
+
+
 class MotorSaturation(DynamicsEffect):
     """``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for the size a of the drive force, with b = ``force``.
 
@@ -161,8 +166,7 @@ class MotorSaturation(DynamicsEffect):
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Limit the force."""
-        limit = ops.where(values["force"] < MAX_FORCE_N, values["force"], MAX_FORCE_N)
-        forces.drive = limited_force(ops, forces.drive, limit, values["roundness"])
+        forces.drive = limited_force(ops, forces.drive, _finite(ops, values["force"]), values["roundness"])
 
 
 def limited_by_direction(ops: Ops, force: Value, forward: Value, backward: Value, roundness: Value) -> Value:
@@ -218,10 +222,7 @@ class SpeedController(DynamicsEffect):
 
     def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Limit the motor's force, damping included."""
-        forward, backward = (
-            ops.where(values[name] < MAX_FORCE_N, values[name], MAX_FORCE_N)
-            for name in ("forward_force", "backward_force")
-        )
+        forward, backward = (_finite(ops, values[name]) for name in ("forward_force", "backward_force"))
         forces.axle_force = limited_by_direction(ops, forces.axle_force, forward, backward, values["roundness"])
 
 

@@ -71,11 +71,11 @@ class Chart:
         self._front: list[str] = []
 
     def _equalised(self, x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-        wide = self._size[0] - self._left - self._right
-        high = self._size[1] - self._top - self._bottom
-        unit = max((x[1] - x[0]) / wide, (y[1] - y[0]) / high)
+        width = self._size[0] - self._left - self._right
+        height = self._size[1] - self._top - self._bottom
+        unit = max((x[1] - x[0]) / width, (y[1] - y[0]) / height)
         middle = (0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]))
-        return tuple((m - 0.5 * unit * px, m + 0.5 * unit * px) for m, px in zip(middle, (wide, high), strict=True))
+        return tuple((m - 0.5 * unit * px, m + 0.5 * unit * px) for m, px in zip(middle, (width, height), strict=True))
 
     def px(self, x: float) -> float:
         """Pixel of an abscissa."""
@@ -157,9 +157,9 @@ class Chart:
 
     def render(self) -> Markup:
         """The SVG element."""
-        wide, high = self._size
-        bottom, right = high - self._bottom, wide - self._right
-        parts = [f'<svg viewBox="0 0 {wide} {high}" role="img"><title>{escape(self._title)}</title>']
+        width, height = self._size
+        bottom, right = height - self._bottom, width - self._right
+        parts = [f'<svg viewBox="0 0 {width} {height}" role="img"><title>{escape(self._title)}</title>']
         for tick in nice_ticks(*self._y, max_steps=4):
             at = self.py(tick)
             parts.append(f'<path class="grid" d="M{self._left:.1f} {at:.1f}H{right:.1f}"/>')
@@ -176,7 +176,7 @@ class Chart:
         parts += self._front
         x_label, y_label = (escape(label) for label in self._labels)
         if x_label:
-            parts.append(f'<text class="label" x="{right:.1f}" y="{high - 6}" text-anchor="end">{x_label}</text>')
+            parts.append(f'<text class="label" x="{right:.1f}" y="{height - 6}" text-anchor="end">{x_label}</text>')
         if y_label:
             parts.append(f'<text class="label" x="4" y="13">{y_label}</text>')
         parts.append("</svg>")
@@ -190,16 +190,16 @@ def interval_bar(value: float, low: float, high: float) -> Markup:
     left, right = min(low, 0.0), max(high, 0.0)
     if right - left <= 0.0:
         return Markup("")
-    wide, high_px = INTERVAL_BAR_PX
-    middle = high_px / 2
+    width, height = INTERVAL_BAR_PX
+    middle = height / 2
 
     def at(v: float) -> float:
-        return 8.0 + (v - left) / (right - left) * (wide - 16.0)
+        return 8.0 + (v - left) / (right - left) * (width - 16.0)
 
     return Markup(
-        f'<svg class="mini" viewBox="0 0 {wide} {high_px}" width="{wide}" height="{high_px}" aria-hidden="true">'
+        f'<svg class="mini" viewBox="0 0 {width} {height}" width="{width}" height="{height}" aria-hidden="true">'
         f'<path class="grid" d="M{at(left):.1f} {middle}H{at(right):.1f}"/>'
-        f'<path class="zero" d="M{at(0.0):.1f} 3V{high_px - 3}"/>'
+        f'<path class="zero" d="M{at(0.0):.1f} 3V{height - 3}"/>'
         f'<path class="interval" d="M{at(low):.1f} {middle}H{at(high):.1f}"/>'
         f'<circle class="dot with_effects" cx="{at(value):.1f}" cy="{middle}" r="4.5"/></svg>'
     )
@@ -214,17 +214,17 @@ def bar_rows(
     size: tuple[int, int] = (560, 26),
 ) -> Markup:
     """Horizontal bars from zero: label, value, text at the end, style; with a dashed line at ``reference``."""
-    wide, row_px = size
+    width, row_px = size
     finite = [v for _, v, _, _ in rows if math.isfinite(v)]
     top = max([*finite, reference or 0.0, 1e-12])
     low = min([*finite, 0.0])
-    room = wide - label_px - 62.0
+    room = width - label_px - 62.0
     height = row_px * len(rows) + 8
 
     def at(v: float) -> float:
         return label_px + (v - low) / (top - low) * room
 
-    parts = [f'<svg viewBox="0 0 {wide} {height}" role="img"><title>{escape(title)}</title>']
+    parts = [f'<svg viewBox="0 0 {width} {height}" role="img"><title>{escape(title)}</title>']
     for k, (label, value, end_text, style) in enumerate(rows):
         middle = 4 + row_px * (k + 0.5)
         parts.append(
