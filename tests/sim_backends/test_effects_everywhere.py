@@ -70,10 +70,16 @@ def test_catalogue_is_complete():
         assert all(each.lag_parameter for each in (effect, *parts) if parts)
 
 
+OTHERS = [name for name in NAMES if name != "tyre_saturation"]  # which turns a kinematic car into a dynamic one
+GROUPS = [("tyre_saturation",), *(tuple(OTHERS[k::6]) for k in range(6))]
+"""Sets of effects of which none hides another one. Each set of effects is compiled, so a set is faster than its parts.
+"""
+
+
 @functools.cache
-def with_gradients(name, engine):
-    """Return the rollout with an effect at its identity or without one, and its leaves and values with gradients."""
-    config = SimulatorConfig(effects={} if name is None else {name: {}})
+def with_gradients(names, engine):
+    """Return the rollout with effects at their identity, and its leaves and values with gradients."""
+    config = SimulatorConfig(effects={name: {} for name in names})
     numbers = {k: v for k, v in config.values().items() if k != "timing.control_period"}
     # The latency effect replaces the base model's latency, so their gradients differ.
     numbers = {k: v for k, v in numbers.items() if not k.startswith("mocap.")}
@@ -87,19 +93,19 @@ def with_gradients(name, engine):
     return out, leaves, values
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("names", GROUPS, ids="-".join)
 @pytest.mark.parametrize("engine", ["fastest", "operators"])
-def test_effect_at_its_identity_changes_neither_states_nor_gradients(name, engine):
-    plain, plain_leaves, plain_values = with_gradients(None, engine)
-    same, leaves, values = with_gradients(name, engine)
+def test_effects_at_their_identity_change_neither_states_nor_gradients(names, engine):
+    plain, plain_leaves, plain_values = with_gradients((), engine)
+    same, leaves, values = with_gradients(names, engine)
     assert (plain.states - same.states).abs().max() <= 1e-12
     assert (plain.measured - same.measured).abs().max() <= 1e-12
     for key, value in values.items():
         assert value.grad is None or torch.isfinite(value.grad).all(), key
-        if key in plain_values and not (key.startswith("tyre.") and name == "tyre_saturation"):
+        if key in plain_values and not (key.startswith("tyre.") and "tyre_saturation" in names):
             assert torch.allclose(value.grad, plain_values[key].grad, rtol=1e-9, atol=1e-9), key
-    for with_effect, without in zip(leaves, plain_leaves, strict=True):
-        assert torch.allclose(with_effect.grad, without.grad, rtol=1e-9, atol=1e-9)
+    for with_effects, without in zip(leaves, plain_leaves, strict=True):
+        assert torch.allclose(with_effects.grad, without.grad, rtol=1e-9, atol=1e-9)
 
 
 @functools.cache
@@ -141,13 +147,14 @@ def test_identity_of_the_numbers_holds_for_each_choice(name, choice, word, kind)
     assert (plain.states - same.states).abs().max() <= 1e-12
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
-def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeypatch):
-    """Without delay all engines use the same steps."""
-    config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={name: typical(name)})
-    if EFFECTS[name].kind == "input" and "delay" in name:
-        config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={name: {}})
+def at_typical_values(names):
+    """Return effects without delay at their typical values; a delay effect is at its identity."""
+    delays = [name for name in names if EFFECTS[name].kind == "input" and "delay" in name]
+    return {name: {} if name in delays else typical(name) for name in names}
+
+
+def check_engines(config, monkeypatch):
+    """Assert that plant, arrays, operators and compiled gradients have equal states; without delay steps are equal."""
     start, commands = some()
     arrays = rollout(config, start, commands).states
     operators = rollout(config, start, commands, engine="operators").states
@@ -165,6 +172,17 @@ def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeyp
             plant.command(k * config.control_period_s, Action(*commands[i, k].tolist()))
             plant.advance((k + 1) * config.control_period_s)
             assert np.allclose(plant.state.to_array(), arrays[i, k + 1].numpy(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_plant_arrays_operators_and_compiled_gradients_agree(name, monkeypatch):
+    check_engines(SimulatorConfig(command_delay_s=0.0, effects=at_typical_values([name])), monkeypatch)
+
+
+@pytest.mark.parametrize("names", GROUPS, ids="-".join)
+def test_plant_arrays_operators_and_compiled_gradients_of_a_kinematic_car_agree(names, monkeypatch):
+    """Half of the effects change no kinematic car."""
+    check_engines(SimulatorConfig(kind="kinematic", command_delay_s=0.0, effects=at_typical_values(names)), monkeypatch)
 
 
 @pytest.mark.parametrize("name", NAMES)
