@@ -91,6 +91,15 @@ def test_a_car_has_the_same_states_and_gradients_in_a_batch_of_any_size(dtype):
             assert torch.equal(part, all_cars[:cars])
 
 
+@pytest.mark.parametrize("measured", [False, True])
+@pytest.mark.parametrize("needs_gradient", [False, True])
+def test_batch_without_cars_has_no_states(needs_gradient, measured):
+    start, commands = some(0, 3)
+    out = rollout(SimulatorConfig(), start, commands.requires_grad_(needs_gradient), measured=measured)
+    assert out.states.shape == (0, 4, 6)
+    assert not measured or out.measured.shape == (0, 4, 6)
+
+
 def test_batches_of_several_threads_do_not_disturb_each_other():
     start, commands = some(500, 10)
     expected = rollout(SimulatorConfig(), start, commands).states
