@@ -69,7 +69,7 @@ def test_preset_with_effects_is_the_eth_car_with_a_range_for_each_effect():
     assert {n for n, r in plain.priors.items() if uncertain.priors[n] != r} == {"motor.drive_gain", "motor.damping"}
     of_effects = set(uncertain.priors) - set(plain.priors)
     assert {name.split(".")[1] for name in of_effects} == set(uncertain.effects)
-    assert len(uncertain.effects) == 8
+    assert len(uncertain.effects) == 9
 
 
 @pytest.mark.parametrize("name", ALL_CARS)
