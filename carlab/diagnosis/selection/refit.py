@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,10 +20,10 @@ from sim_backends.car_parameters import SimulatorConfig
 def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale: Scale) -> Model:
     """Fit with ``effects``, starting from their values in ``initial``; an equal refit is not repeated."""
     start = _start(problem, effects, initial)
-    key = _key(effects, start, scale)
+    key = _key(problem, effects, start, scale)
     if key not in problem.refits:
         problem.refits[key] = _fit_from(problem, effects, start, scale)
-    return problem.refits[key]
+    return _in_order(problem, problem.refits[key], effects)
 
 
 def refit_without_each(
@@ -32,7 +33,7 @@ def refit_without_each(
     removed = model.effects if names is None else names
     others = {name: tuple(e for e in model.effects if e != name) for name in removed}
     starts = {name: _start(problem, effects, model.fit) for name, effects in others.items()}
-    keys = {name: _key(effects, starts[name], model.scale) for name, effects in others.items()}
+    keys = {name: _key(problem, effects, starts[name], model.scale) for name, effects in others.items()}
     new = [name for name in removed if keys[name] not in problem.refits]
     fitted = control.workers.map(
         _fit_from,
@@ -40,7 +41,7 @@ def refit_without_each(
         started=lambda k: control.progress(f"refitting without {new[k]}", 0.93),
     )
     problem.refits.update((keys[name], each) for name, each in zip(new, fitted, strict=True) if each is not None)
-    return {name: problem.refits[key] for name, key in keys.items()}
+    return {name: _in_order(problem, problem.refits[key], others[name]) for name, key in keys.items()}
 
 
 def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> FloatArray:
@@ -49,8 +50,16 @@ def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> Fl
     return np.array([known.get(f.name, 0.0) for f in problem.free_parameters(effects)])
 
 
-def _key(effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
-    return effects, start.tobytes(), scale.as_bytes()
+def _key(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
+    """What a refit depends on; the order of the effects changes rounding errors only."""
+    names = (f.name for f in problem.free_parameters(effects))
+    return frozenset(zip(names, start.tolist(), strict=True)), scale.as_bytes()
+
+
+def _in_order(problem: SearchProblem, model: Model, effects: tuple[str, ...]) -> Model:
+    """The model with its effects and parameters in the order of ``effects``."""
+    free, z = problem.free_parameters(effects), _start(problem, effects, model.fit)
+    return replace(model, effects=effects, fit=replace(model.fit, free=free, z=z))
 
 
 def _fit_from(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Model:
