@@ -274,7 +274,7 @@ def _assemble_result(
         ),
         drift=() if adaptation is None else adaptation.drift,
         car_file_parameters=_stated_parameters(request.nominal),
-        limits=effect_limits(scored),
+        limits=effect_limits(scored, control.workers),
         events=recordings.events,
         held_out_with_events=errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )

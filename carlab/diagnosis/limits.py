@@ -18,6 +18,7 @@ from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.block_jackknife import interval_quantile
 from carlab.diagnosis.identification.fit import Fit, Fitter, Linearisation
 from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
+from carlab.jobs.function_workers import FunctionWorkers
 from sim_backends.effects import CATALOGUE
 from sim_backends.registry import REGISTRY
 
@@ -29,7 +30,7 @@ MIN_INFORMATION = 1e-6
 """Mean square change of the whitened errors per typical size below which a parameter has no influence."""
 
 
-def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
+def effect_limits(scored: ScoredSearch, workers: FunctionWorkers) -> dict[str, dict[str, Estimate]]:
     """Estimates of the parameters of each candidate effect that is not named, by effect and parameter.
 
     An effect is omitted if one of its parameters has an infinite identity, or no influence at the identities of the
@@ -40,20 +41,21 @@ def effect_limits(scored: ScoredSearch) -> dict[str, dict[str, Estimate]]:
     fit = replace(scored.fit, config=problem.config_with(found.effects))
     linearised = fitter.linearised(scored.fit)
     z90 = interval_quantile(len(np.unique(problem.windows.block)), problem.settings.evidence.interval_probability)
-    limits = {}
+    factor = standard_error_factor(scored)
+    joints = {}
     for effect in CATALOGUE:
         if effect in found.effects or not problem.is_candidate(effect):
             continue
         free = tuple(p for p in effect_parameters(effect, problem.nominal) if not p.choice)
         if not any(p.logarithmic for p in free):
-            joint = replace(
+            joints[effect] = replace(
                 fit,
                 config=with_effect(fit.config, effect),
                 free=(*fit.free, *free),
                 z=np.concatenate([fit.z, np.zeros(len(free))]),
             )
-            limits[effect] = _limits(fitter, joint, linearised, standard_error_factor(scored), z90)
-    return {effect: parameters for effect, parameters in limits.items() if parameters}
+    limits = workers.map(_limits, [(fitter, joint, linearised, factor, z90) for joint in joints.values()])
+    return {effect: parameters for effect, parameters in zip(joints, limits, strict=True) if parameters}
 
 
 def _limits(

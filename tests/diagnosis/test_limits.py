@@ -16,6 +16,7 @@ from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import DEFAULT
+from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
@@ -51,7 +52,7 @@ def correct() -> ScoredSearch:
 
 @pytest.fixture(scope="module")
 def limits(correct: ScoredSearch) -> dict[str, dict[str, Estimate]]:
-    return effect_limits(correct)
+    return effect_limits(correct, FunctionWorkers())
 
 
 @pytest.mark.parametrize("effect", FITTED)
@@ -71,7 +72,7 @@ def test_limits_agree_with_fits_of_the_effect(
 
 def test_limits_are_wider_where_the_model_errs(correct: ScoredSearch, limits: dict[str, dict[str, Estimate]]) -> None:
     """By the factors on standard errors; the size at which a slope is taken grows too, so not exactly."""
-    std = effect_limits(replace(correct, excess=1.0))["steering_lag"]["time_constant"].std
+    std = effect_limits(replace(correct, excess=1.0), FunctionWorkers())["steering_lag"]["time_constant"].std
     factors = DEFAULT.evidence.model_interval_factor / DEFAULT.evidence.interval_factor
     assert std == pytest.approx(factors * limits["steering_lag"]["time_constant"].std, rel=0.1)
     assert factors > 1.2
@@ -89,7 +90,7 @@ def test_limits_of_a_correct_car_contain_the_identities(limits: dict[str, dict[s
     ("effect", "name", "size"), [("steering_lag", "time_constant", 0.003), ("steering_offset", "angle", -0.001)]
 )
 def test_limit_contains_a_small_effect_that_has_no_name(effect: str, name: str, size: float) -> None:
-    limit = effect_limits(searched(replace(CAR, effects={effect: {name: size}})))[effect][name]
+    limit = effect_limits(searched(replace(CAR, effects={effect: {name: size}})), FunctionWorkers())[effect][name]
     assert limit.low90 < size < limit.high90
     assert abs(limit.value) > 3.0 * limit.std
 
@@ -99,7 +100,8 @@ def test_interval_beyond_the_range_of_a_number_is_marked(correct: ScoredSearch) 
     late = replace(CAR, command_delay_s=CAR.command_delay_s + 0.03)
     found = replace(correct.found, base=replace(correct.fit, config=late), best=replace(correct.fit, config=late))
     problem = replace(correct.problem, nominal=late)
-    limit = effect_limits(replace(correct, problem=problem, found=found, fit=found.best))["steering_delay"]["delay"]
+    with_bound = replace(correct, problem=problem, found=found, fit=found.best)
+    limit = effect_limits(with_bound, FunctionWorkers())["steering_delay"]["delay"]
     assert (limit.value, limit.low90, limit.high90, limit.at_limit) == (0.0, 0.0, 0.0, True)
 
 

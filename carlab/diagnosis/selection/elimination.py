@@ -36,10 +36,13 @@ def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> di
         return {}
     fitter = problem.fitter(model.scale)
     folds, limit = problem.folds(), problem.settings.selection.max_left_out_error
-    with_all = fitter.leave_fold_out_loss(model.fit, folds, limit)
+    without = refit_without_each(problem, model, control)
+    fits = [model.fit, *(reduced.fit for reduced in without.values())]
+    with_all, *losses = control.workers.map(fitter.leave_fold_out_loss, [(fit, folds, limit) for fit in fits])
+    assert with_all is not None
     found = {}
-    for name, reduced in refit_without_each(problem, model, control).items():
-        loss = fitter.leave_fold_out_loss(reduced.fit, folds, limit)
+    for (name, reduced), loss in zip(without.items(), losses, strict=True):
+        assert loss is not None
         rise, error = clustered_gain(loss, with_all, problem.windows)
         found[name] = Deletion(reduced.fit, rise / error)
     return found

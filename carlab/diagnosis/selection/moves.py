@@ -6,6 +6,7 @@ The first accepted effect is often a proxy of the true effect.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 
 from carlab.diagnosis.identification.fit import design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
@@ -21,36 +22,64 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
     if len(model.effects) < 2 or control.ends_search():
         return model
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
+    significant: dict[str, Model] = {}
     for name, reduced in refit_without_each(problem, model, control, model.effects[:-1]).items():
         chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(with_covariance, name)
         if chi2 < problem.settings.selection.keep_chi2_min:
-            log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
-            config = problem.config_with(reduced.effects)
-            smaller = fit_with_scale(problem, reduced.effects, config, reduced.fit.free, reduced.fit.z)
-            return apply_moves(problem, smaller, control)
-        swapped = _swap(problem, model, reduced, name, control)
-        if swapped is not None:
-            return swapped
-    return model
+            swapped = _swap(problem, model, significant, control)
+            return swapped or apply_moves(problem, _without(problem, reduced, name, chi2), control)
+        significant[name] = reduced
+    return _swap(problem, model, significant, control) or model
 
 
-def _swap(problem: SearchProblem, model: Model, reduced: Model, name: str, control: RunControl) -> Model | None:
-    """The model with a confusable effect in place of ``name``; None if none is significantly better."""
+def _without(problem: SearchProblem, reduced: Model, name: str, chi2: float) -> Model:
+    """The model ``reduced``, which lacks the insignificant effect ``name``, with its own scale."""
+    log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
+    config = problem.config_with(reduced.effects)
+    return fit_with_scale(problem, reduced.effects, config, reduced.fit.free, reduced.fit.z)
+
+
+def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], control: RunControl) -> Model | None:
+    """The model with a confusable effect in place of one of its effects; None if none is significantly better.
+
+    Args:
+        problem: the search problem.
+        model: the model.
+        reduced: the model without an effect, by effect; the first effect with a better confusable one is replaced.
+        control: workers, which share the fits of all confusable effects.
+    """
     settings, screening = problem.settings.selection, problem.settings.screening
-    confusable = problem.confusable.get(name, ())
-    others = [other for other in confusable if other not in model.effects and problem.is_candidate(other)]
-    if not others or control.ends_search():
+    pairs = [
+        (name, other)
+        for name in reduced
+        for other in problem.confusable.get(name, ())
+        if other not in model.effects and problem.is_candidate(other)
+    ]
+    if not pairs or control.ends_search():
         return None
-    fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
-    screen = Screen(fitter, config, reduced.fit, screening.max_windows, screening)
-    min_score = settings.swap_score_share * (reduced.fit.cost - model.fit.cost)
-    arguments = [(problem.without_refits(), model, reduced, screen, other, min_score) for other in others]
-    for swap in control.workers.map(_fitted_swap, arguments, stop=control.ends_search):
+    fitter = problem.fitter(model.scale)
+    screens = {}
+    for name in dict(pairs):
+        config, fit = problem.config_with(reduced[name].effects), reduced[name].fit
+        screens[name] = Screen(fitter, config, fit, screening.max_windows, screening)
+    arguments = [
+        (
+            problem.without_refits(),
+            model,
+            reduced[name],
+            screens[name],
+            other,
+            settings.swap_score_share * (reduced[name].fit.cost - model.fit.cost),
+        )
+        for name, other in pairs
+    ]
+    swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
+    for (name, _), swap in zip(pairs, swaps, strict=True):
         if swap is not None and swap[1] > settings.keep_chi2_min:
             candidate, chi2 = swap
             log.info("%s replaces %s (chi2 %.1f)", candidate.effect, name, chi2)
-            fit = candidate.fit
-            return fit_with_scale(problem, (*reduced.effects, candidate.effect), fit.config, fit.free, fit.z)
+            fit, effects = candidate.fit, (*reduced[name].effects, candidate.effect)
+            return fit_with_scale(problem, effects, fit.config, fit.free, fit.z)
     return None
 
 
