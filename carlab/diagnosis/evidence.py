@@ -92,10 +92,13 @@ def effect_findings(
     scored: ScoredSearch, texts: Texts, progress: Callable[[float], None] = lambda share: None
 ) -> tuple[EffectFinding, ...]:
     """Each accepted effect with its evidence, the strongest first."""
+    if not scored.found.effects:
+        return ()
+    jacobian = scored.problem.fitter(scored.found.scale).linearised(scored.fit).jacobian
     found = []
     for k, name in enumerate(scored.found.effects):
         progress(k / len(scored.found.effects))
-        found.append(_finding(scored, name, texts))
+        found.append(_finding(scored, name, texts, jacobian))
     return tuple(found)
 
 
@@ -110,7 +113,8 @@ def scores_by_step(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
     return tuple(steps)
 
 
-def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
+def _finding(scored: ScoredSearch, name: str, texts: Texts, jacobian: FloatArray) -> EffectFinding:
+    """An accepted effect; ``jacobian`` (n, S, U, 6) is that of the whitened errors at the fit."""
     found, held_out, full = scored.found, scored.held_out, scored.errors["with_effects"]
     others = tuple(e for e in found.effects if e != name)
     without = refit(scored.problem, others, scored.fit, found.scale).fit
@@ -124,7 +128,7 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
     evidence = Evidence(
         held_out_error_reduction=1.0 - held_out.score(full) / max(held_out.score(error), 1e-12),
         standard_errors=gain / spread,
-        visibility=visibility(scored, name),
+        visibility=visibility(scored.fit, name, jacobian),
         deletion_fingerprint=HeldOut.fingerprint(error, full),
     )
     return EffectFinding(
@@ -208,11 +212,16 @@ def base_estimates(scored: ScoredSearch) -> dict[str, Estimate]:
     return {f.name: estimate(scored, f.name) for f in scored.fit.free if not f.name.startswith("effects.")}
 
 
-def visibility(scored: ScoredSearch, effect: str) -> float:
-    """Share of an effect's influence on the errors that other parameters cannot reproduce, in [0, 1]."""
-    free = scored.fit.free
-    fitter = scored.problem.fitter(scored.found.scale)
-    jacobian = fitter.linearised(scored.fit)[0].reshape(len(free), -1)
+def visibility(fit: Fit, effect: str, jacobian: FloatArray) -> float:
+    """Share of an effect's influence on the errors that other parameters cannot reproduce, in [0, 1].
+
+    Args:
+        fit: the fit with the effect, n parameters.
+        effect: its id.
+        jacobian: derivatives (n, S, U, 6) of the whitened errors at the fit.
+    """
+    free = fit.free
+    jacobian = jacobian.reshape(len(free), -1)
     own = [k for k, f in enumerate(free) if f.name.startswith(f"effects.{effect}.")]
     other = [k for k in range(len(free)) if k not in own]
     basis, _ = np.linalg.qr(jacobian[other].T)

@@ -322,11 +322,13 @@ class Fitter:
             loss[own] = self.huber(white.clip(-max_error, max_error)).sum(axis=(1, 2))
         return loss
 
-    def leave_fold_out_coordinates(self, fit: Fit, folds: IndexArray) -> FloatArray:
-        """Coordinates (S, n) for every window by a fit without its fold (S,)."""
+    def leave_fold_out_coordinates(
+        self, fit: Fit, folds: IndexArray, linearisation: Linearisation | None = None
+    ) -> FloatArray:
+        """Coordinates (S, n) for every window by a fit without its fold (S,), as ``leave_fold_out_loss``."""
         z = np.tile(fit.z, (len(self.windows), 1))
         if fit.free:
-            for own, without, _ in self._without_each_fold(fit, folds, self.linearised(fit)):
+            for own, without, _ in self._without_each_fold(fit, folds, linearisation or self.linearised(fit)):
                 z[own] = without
         return z
 

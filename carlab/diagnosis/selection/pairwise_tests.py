@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit import Fit, Linearisation, Scale, clustered_gain, design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.selection.delay_groups import confusable_shared_delays
@@ -61,8 +61,10 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
     model, settings = eliminated.model, problem.settings.selection
     if not model.effects:
         return PairwiseResult()
-    with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
-    own_loss = left_out_loss(problem, model.fit, model.scale)
+    fitter = problem.fitter(model.scale)
+    linearisation = fitter.linearised(model.fit)
+    with_covariance = fitter.with_covariance(model.fit, linearisation)
+    own_loss = left_out_loss(problem, model.fit, model.scale, linearisation)
     fitted = _fitted_alternatives(problem, eliminated, control)
     chi2, indistinguishable, replacements = {}, {}, {}
     for name in model.effects:
@@ -124,13 +126,18 @@ def _fitted_alternative(
     return candidate, left_out_loss(problem, candidate.fit, model.scale)
 
 
-def left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
-    """Loss of each window (S,) by a fit without its fold, with free initial states."""
+def left_out_loss(
+    problem: SearchProblem, fit: Fit, scale: Scale, linearisation: Linearisation | None = None
+) -> FloatArray:
+    """Loss of each window (S,) by a fit without its fold, with free initial states.
+
+    ``linearisation`` is that of the errors at the fit; computed by default.
+    """
     return loss_of_free_initial_states(
         problem.windows,
         fit.config,
         fit.free,
-        problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()),
+        problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds(), linearisation),
         problem.measured_std,
         max_error=problem.settings.selection.max_left_out_error,
         settings=problem.settings.identification,
