@@ -1,4 +1,4 @@
-"""Refits of a search: equal ones are not repeated, whatever the order of their effects."""
+"""Refits of a search: equal ones are not repeated, and start at the same values, whatever the order of the effects."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlab.diagnosis.identification.fit import Scale
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.problem import Model, SearchProblem
-from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.selection.refit import refit, refit_candidate
+from carlab.diagnosis.selection.screening import ScreeningResult
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
@@ -21,11 +24,16 @@ CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s
 STD = 3e-4 * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
 
 
-def test_refit_with_effects_in_another_order_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Effects and parameters of the result have the requested order."""
+def short_problem() -> tuple[SearchProblem, Scale]:
+    """A search on 10 s of a car whose steering lags."""
     true = replace(CAR, effects={LAG: {"time_constant": 0.05}})
     problem = SearchProblem(CAR, cut_windows(segments_of([drive(true, 10.0, 3)]), 0.8, 0.5), 3.0 * STD, STD, {})
-    scale = Scale(np.array([8, 16, 24]), np.tile(3.0 * STD, (3, 1)))
+    return problem, Scale(np.array([8, 16, 24]), np.tile(3.0 * STD, (3, 1)))
+
+
+def test_refit_with_effects_in_another_order_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Effects and parameters of the result have the requested order."""
+    problem, scale = short_problem()
     nothing = problem.fitter(scale).fit(CAR, ())
     first = refit(problem, (LAG, BRAKE), nothing, scale)
 
@@ -40,3 +48,25 @@ def test_refit_with_effects_in_another_order_is_not_repeated(monkeypatch: pytest
     assert second.fit.cost == first.fit.cost
     with pytest.raises(AssertionError, match="repeated"):
         refit(problem, (LAG,), nothing, scale)
+
+
+def test_candidate_starts_at_the_values_of_a_fit_whose_effects_have_another_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The effects of a search's result are sorted by strength, the parameters of its fit by acceptance."""
+    problem, scale = short_problem()
+    fit = refit(problem, (LAG, BRAKE), problem.fitter(scale).fit(CAR, ()), scale).fit
+    sorted_model = Model((BRAKE, LAG), fit, scale)
+    begun: dict[str, float] = {}
+    fit_from = Fitter.fit
+
+    def watched(fitter: Fitter, config: SimulatorConfig, free: tuple[FitParameter, ...], start: FloatArray) -> Fit:
+        begun.update(zip((f.name for f in free), start.tolist(), strict=True))
+        return fit_from(fitter, config, free, start)
+
+    monkeypatch.setattr(Fitter, "fit", watched)
+    refit_candidate(problem, sorted_model, ScreeningResult("rolling_resistance", 1.0, np.array([[0.3]])))
+    values = {f.name: float(z) for f, z in zip(fit.free, fit.z, strict=True)}
+    assert begun.pop("effects.rolling_resistance.force") == 0.3
+    assert begun == values
+    assert values[f"effects.{LAG}.time_constant"] != values[f"effects.{BRAKE}.gain_ratio"]

@@ -75,7 +75,8 @@ def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningRes
     fitter = problem.fitter(model.scale)
     effects = (*model.effects, screened.effect)
     config, free = problem.config_with(effects), problem.free_parameters(effects)
-    starts = [np.concatenate([model.fit.z, s]) for s in screened.starts]
+    before = _start(problem, model.effects, model.fit)
+    starts = [np.concatenate([before, s]) for s in screened.starts]
     if len(starts) > 1:
         settings = problem.settings.selection
         few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
