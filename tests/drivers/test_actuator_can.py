@@ -243,12 +243,13 @@ def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, vict
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert firmware.stdout is not None
-    assert "id 23" in firmware.stdout.readline()
-    main = subprocess.Popen(
-        [sys.executable, "-c", CHILD, channel], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    main = None
     try:
+        assert firmware.stdout is not None
+        assert "id 23" in firmware.stdout.readline()
+        main = subprocess.Popen(
+            [sys.executable, "-c", CHILD, channel], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         assert main.stdout is not None
         assert main.stderr is not None
         line = main.stdout.readline()
@@ -259,8 +260,9 @@ def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, vict
         main.communicate(timeout=TIMEOUT_S)
         until(lambda: any(e.name == "motor_timeout" for e in read_log(log)))
     finally:
-        main.kill()
-        main.communicate()
+        if main is not None:
+            main.kill()
+            main.communicate()
         firmware.communicate(timeout=TIMEOUT_S)
     entries = read_log(log)
     motor = [e for e in entries if e.name in ("current", "brake", "duty", "rpm")]

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -128,7 +129,7 @@ class Drive:
     """A child process that drives at 50 Hz, and its emulated firmware."""
 
     def __init__(self, firmware: SerialFirmware, failure: str) -> None:
-        self.log = firmware.log
+        self.log, self.failure = firmware.log, failure
         self.process = subprocess.Popen(
             [sys.executable, "-c", CHILD, firmware.port, failure],
             cwd=ROOT,
@@ -139,7 +140,12 @@ class Drive:
         )
         assert self.process.stdout is not None
         self.lines = self.process.stdout
-        self.sender_pid = int(self.lines.readline().split()[1]) if failure != "no_close" else 0
+        self.sender_pid = 0
+
+    def wait_until_moving(self) -> None:
+        """Wait for the first motor command that is not neutral; the child prints its sender, except "no_close"."""
+        if self.failure != "no_close":
+            self.sender_pid = int(self.lines.readline().split()[1])
         until(lambda: any(e.value == 3.0 for e in self.log.motor()))
 
     def end(self) -> str:
@@ -147,12 +153,35 @@ class Drive:
         output, _ = self.process.communicate(timeout=TIMEOUT_S)
         return str(output)
 
+    def kill(self) -> None:
+        """End the child of a test that failed; else a later test would fail by its warning."""
+        self.process.kill()
+        self.process.communicate()
+
 
 @pytest.fixture
 def firmware(tmp_path: Path) -> SerialFirmware:
     return SerialFirmware(
         VescFirmware(CommandLog(tmp_path / "log.jsonl"), motor_timeout_s=MOTOR_TIMEOUT_S), link=tmp_path / "vesc"
     )
+
+
+Start = Callable[[str], Drive]
+
+
+@pytest.fixture
+def start_drive(firmware: SerialFirmware) -> Iterator[Start]:
+    """Start a child with a failure, and wait until its car moves."""
+    drives: list[Drive] = []
+
+    def start(failure: str) -> Drive:
+        drives.append(Drive(firmware, failure))
+        drives[-1].wait_until_moving()
+        return drives[-1]
+
+    yield start
+    for drive in drives:
+        drive.kill()
 
 
 def assert_ended_in_neutral(log: CommandLog) -> list[LogEntry]:
@@ -173,9 +202,11 @@ def assert_ended_in_neutral(log: CommandLog) -> list[LogEntry]:
 @pytest.mark.parametrize(
     "failure", ["exception", "os_exit", "sys_exit", "no_close", "fork", "forked_worker_then_sigkill"]
 )
-def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware, failure: str) -> None:
+def test_every_exit_of_the_main_process_ends_in_neutral(
+    firmware: SerialFirmware, start_drive: Start, failure: str
+) -> None:
     with firmware:
-        drive = Drive(firmware, failure)
+        drive = start_drive(failure)
         if failure == "fork":
             assert drive.lines.readline().split() == ["forked", "NotOpenError"]
             t_s = time.monotonic()
@@ -195,9 +226,11 @@ def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_every_signal_to_the_main_process_ends_in_neutral(firmware: SerialFirmware, number: signal.Signals) -> None:
+def test_every_signal_to_the_main_process_ends_in_neutral(
+    firmware: SerialFirmware, start_drive: Start, number: signal.Signals
+) -> None:
     with firmware:
-        drive = Drive(firmware, "forever")
+        drive = start_drive("forever")
         drive.process.send_signal(number)
         t_s = time.monotonic()
         drive.end()
@@ -206,9 +239,11 @@ def test_every_signal_to_the_main_process_ends_in_neutral(firmware: SerialFirmwa
         assert len(moving_afterwards) < 100, "one second at the send rate"
 
 
-def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(firmware: SerialFirmware) -> None:
+def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(
+    firmware: SerialFirmware, start_drive: Start
+) -> None:
     with firmware:
-        drive = Drive(firmware, "forever")
+        drive = start_drive("forever")
         drive.process.send_signal(signal.SIGSTOP)
         time.sleep(1.7)
         moving = [e.t_s for e in firmware.log.motor() if e.value != 0.0]
@@ -223,9 +258,9 @@ def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(fi
         assert all(e.value == 0.0 for e in firmware.log.motor(t_resumed_s))
 
 
-def test_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: SerialFirmware) -> None:
+def test_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: SerialFirmware, start_drive: Start) -> None:
     with firmware:
-        drive = Drive(firmware, "hang")
+        drive = start_drive("hang")
         assert drive.lines.readline().strip() == "hanging"
         t_s = time.monotonic()
         output = drive.end()
@@ -236,9 +271,11 @@ def test_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: SerialFi
         assert all(e.value == 0.0 for e in later)
 
 
-def test_firmware_timeout_stops_the_motor_after_the_sender_is_killed(firmware: SerialFirmware) -> None:
+def test_firmware_timeout_stops_the_motor_after_the_sender_is_killed(
+    firmware: SerialFirmware, start_drive: Start
+) -> None:
     with firmware:
-        drive = Drive(firmware, "forever")
+        drive = start_drive("forever")
         os.kill(drive.sender_pid, signal.SIGKILL)
         t_s = time.monotonic()
         output = drive.end()
@@ -249,9 +286,11 @@ def test_firmware_timeout_stops_the_motor_after_the_sender_is_killed(firmware: S
         assert not [e for e in firmware.log.motor() if e.t_s > max(timeout.t_s, t_s + 0.5)]
 
 
-def test_suspended_sender_is_detected_and_cannot_move_the_car_later(firmware: SerialFirmware) -> None:
+def test_suspended_sender_is_detected_and_cannot_move_the_car_later(
+    firmware: SerialFirmware, start_drive: Start
+) -> None:
     with firmware:
-        drive = Drive(firmware, "retry_on_request")
+        drive = start_drive("retry_on_request")
         os.kill(drive.sender_pid, signal.SIGSTOP)
         assert firmware.log.wait_for("motor_timeout", TIMEOUT_S) is not None
         line = drive.lines.readline()
@@ -266,9 +305,9 @@ def test_suspended_sender_is_detected_and_cannot_move_the_car_later(firmware: Se
         assert all(e.value == 0.0 for e in firmware.log.motor(t_s))
 
 
-def test_unplugging_latches_a_fault_and_the_firmware_times_out(firmware: SerialFirmware) -> None:
+def test_unplugging_latches_a_fault_and_the_firmware_times_out(firmware: SerialFirmware, start_drive: Start) -> None:
     with firmware:
-        drive = Drive(firmware, "forever")
+        drive = start_drive("forever")
         firmware.unplug()
         output = drive.end()
         assert "error ActuatorFaultError" in output
