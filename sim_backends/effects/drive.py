@@ -133,8 +133,8 @@ def limited_force(ops: Ops, force: Value, limit: Value, roundness: Value) -> Val
     return 2.0 * force * limit / (size + limit + root)
 
 
-def _finite(ops: Ops, force: Value) -> Value:
-    """A limit [N], at most ``MAX_FORCE_N``: an infinite one gives no finite force."""
+def _finite_limit(ops: Ops, force: Value) -> Value:
+    """Replace an infinite limit (cars,) [N] by ``MAX_FORCE_N``, because ``limited_force`` needs a finite one."""
     return ops.where(force < MAX_FORCE_N, force, MAX_FORCE_N)
 
 
@@ -166,7 +166,7 @@ class MotorSaturation(DynamicsEffect):
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Limit the force."""
-        forces.drive = limited_force(ops, forces.drive, _finite(ops, values["force"]), values["roundness"])
+        forces.drive = limited_force(ops, forces.drive, _finite_limit(ops, values["force"]), values["roundness"])
 
 
 def limited_by_direction(ops: Ops, force: Value, forward: Value, backward: Value, roundness: Value) -> Value:
@@ -222,7 +222,7 @@ class SpeedController(DynamicsEffect):
 
     def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Limit the motor's force, damping included."""
-        forward, backward = (_finite(ops, values[name]) for name in ("forward_force", "backward_force"))
+        forward, backward = (_finite_limit(ops, values[name]) for name in ("forward_force", "backward_force"))
         forces.axle_force = limited_by_direction(ops, forces.axle_force, forward, backward, values["roundness"])
 
 

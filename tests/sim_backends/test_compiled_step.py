@@ -38,9 +38,9 @@ def some(cars, ticks):
 def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_car_delay):
     config = SimulatorConfig(kind=kind, effects=effects)
     cars = 5
-    results = []  # four ticks: one more than the longest delay
+    results = []
     for engine in ("fastest", "operators"):
-        start, commands = (v.requires_grad_() for v in some(cars, 4))
+        start, commands = (v.requires_grad_() for v in some(cars, 4))  # one tick more than the longest delay
         delay = torch.linspace(0.02, 0.09, cars, dtype=torch.float64, requires_grad=True)
         mu = torch.linspace(0.3, 0.5, cars, dtype=torch.float64, requires_grad=True)
         values = {"tyre.front.mu": mu, **({"timing.command_delay": delay} if per_car_delay else {})}

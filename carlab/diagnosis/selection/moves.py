@@ -27,26 +27,27 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
         chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(with_covariance, name)
         if chi2 < problem.settings.selection.keep_chi2_min:
             swapped = _swap(problem, model, significant, control)
-            return swapped or apply_moves(problem, _without(problem, reduced, name, chi2), control)
+            if swapped is not None:
+                return swapped
+            log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
+            config = problem.config_with(reduced.effects)
+            smaller = fit_with_scale(problem, reduced.effects, config, reduced.fit.free, reduced.fit.z)
+            return apply_moves(problem, smaller, control)
         significant[name] = reduced
     return _swap(problem, model, significant, control) or model
 
 
-def _without(problem: SearchProblem, reduced: Model, name: str, chi2: float) -> Model:
-    """The model ``reduced``, which lacks the insignificant effect ``name``, with its own scale."""
-    log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
-    config = problem.config_with(reduced.effects)
-    return fit_with_scale(problem, reduced.effects, config, reduced.fit.free, reduced.fit.z)
-
-
 def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], control: RunControl) -> Model | None:
-    """The model with a confusable effect in place of one of its effects; None if none is significantly better.
+    """Replace an effect of the model by a confusable effect that fits significantly better.
 
     Args:
         problem: the search problem.
         model: the model.
-        reduced: the model without an effect, by effect; the first effect with a better confusable one is replaced.
+        reduced: for each effect that may be replaced, the model refitted without it.
         control: workers, which share the fits of all confusable effects.
+
+    Returns:
+        The model with the first such replacement, in the order of ``reduced``; None if there is none.
     """
     settings, screening = problem.settings.selection, problem.settings.screening
     pairs = [
@@ -57,21 +58,14 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     ]
     if not pairs or control.ends_search():
         return None
-    fitter = problem.fitter(model.scale)
-    screens = {}
+    fitter, without_refits = problem.fitter(model.scale), problem.without_refits()
+    screens, min_scores = {}, {}
     for name in dict(pairs):
         config, fit = problem.config_with(reduced[name].effects), reduced[name].fit
         screens[name] = Screen(fitter, config, fit, screening.max_windows, screening)
+        min_scores[name] = settings.swap_score_share * (fit.cost - model.fit.cost)
     arguments = [
-        (
-            problem.without_refits(),
-            model,
-            reduced[name],
-            screens[name],
-            other,
-            settings.swap_score_share * (reduced[name].fit.cost - model.fit.cost),
-        )
-        for name, other in pairs
+        (without_refits, model, reduced[name], screens[name], other, min_scores[name]) for name, other in pairs
     ]
     swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
     for (name, _), swap in zip(pairs, swaps, strict=True):

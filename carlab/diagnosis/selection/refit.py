@@ -51,7 +51,7 @@ def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> Fl
 
 
 def _key(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
-    """What a refit depends on; the order of the effects changes rounding errors only."""
+    """Starting values by name, and the scale: what a refit depends on. The order of effects changes rounding only."""
     names = (f.name for f in problem.free_parameters(effects))
     return frozenset(zip(names, start.tolist(), strict=True)), scale.as_bytes()
 
