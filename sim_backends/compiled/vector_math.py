@@ -11,7 +11,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,17 @@ Name: TypeAlias = str
 _FRACTION_BITS = {32: 23, 64: 52}
 _EXPONENT_BIAS = {32: 127, 64: 1023}
 _TANH_BY_POLYNOMIAL = 0.625
+_FUNCTIONS = ("atan", "atan2", "exp", "log", "pow", "tanh")
+"""Operations that are functions of the code, besides sine and cosine."""
+
+
+class Function(NamedTuple):
+    """A function of the code."""
+
+    result_type: str
+    """A structure of vectors."""
+    results: int
+    code: list[str]
 
 
 @dataclass(slots=True)
@@ -46,8 +57,11 @@ class VectorWriter:
     lanes: int
     lines: list[str] = field(default_factory=list)
     """The code so far; may be replaced by another list between two operations."""
+    functions: dict[str, Function] = field(default_factory=dict)
+    """Functions that ``lines`` calls, by operation. Written at each call instead, they would be most of the
+    code, and it would take two to four times as long to compile."""
     _written: int = 0
-    _sin_cos: dict[Name, tuple[Name, Name]] = field(default_factory=dict)
+    _sin_cos: dict[Name, list[Name]] = field(default_factory=dict)
 
     @property
     def type(self) -> str:
@@ -112,14 +126,16 @@ class VectorWriter:
 
     def _call(self, function: str, *arguments: Name) -> Name:
         kind = f"v{self.lanes}f{self.bits}"
-        given = ", ".join(f"{self.type} {x}" for x in arguments)
-        return self.write(f"call {self.type} @llvm.{function}.{kind}({given})")
+        return self.write(f"call {self.type} @llvm.{function}.{kind}({self._typed(arguments)})")
 
     def declarations(self) -> list[str]:
-        """Declarations of the functions of LLVM that the code calls."""
+        """LLVM's functions and own functions that the code calls."""
         kind, vector = f"v{self.lanes}f{self.bits}", self.type
         counts = {"fmuladd": 3, "fabs": 1, "sqrt": 1, "copysign": 2}
-        return [f"declare {vector} @llvm.{f}.{kind}({', '.join([vector] * n)})" for f, n in counts.items()]
+        return [
+            *(f"declare {vector} @llvm.{f}.{kind}({', '.join([vector] * n)})" for f, n in counts.items()),
+            *(line for function in self.functions.values() for line in function.code),
+        ]
 
     def compare(self, relation: str, a: Name, b: Name) -> Name:
         """Booleans of an ordered comparison: ``olt``, ``ole``, ``ogt``."""
@@ -178,9 +194,7 @@ class VectorWriter:
             x = self.fma(negative, self.constant(part), x)
         return x
 
-    def _sine_and_cosine(self, x: Name) -> tuple[Name, Name]:
-        if x in self._sin_cos:
-            return self._sin_cos[x]
+    def _sine_and_cosine(self, x: Name) -> list[Name]:
         turns, integers = self._rounded(self.mul(x, self.constant(2.0 / math.pi)))
         r = self._reduced(x, turns, HALF_PI_PARTS[self.bits])
         limit = math.pi / 4 * 1.01  # of use only where x is so large that its fraction is lost
@@ -191,11 +205,10 @@ class VectorWriter:
         cosine = self.fma(self.mul(s, s), high, self.fma(s, self.constant(-0.5), self.constant(1.0)))
         odd = self._bit(integers, 0)
         sine_sign, cosine_sign = self._sign_bit(integers, 0), self._sign_bit(integers, 1)
-        self._sin_cos[x] = (
+        return [
             self._flipped(self.where(odd, cosine, sine), sine_sign),
             self._flipped(self.where(odd, sine, cosine), cosine_sign),
-        )
-        return self._sin_cos[x]
+        ]
 
     def _integer(self, value: int) -> Name:
         return f"splat (i{self.bits} {value})"
@@ -217,11 +230,17 @@ class VectorWriter:
 
     def sin(self, x: Name) -> Name:
         """Sine; of arguments so large that their fraction is lost, any number in [-1, 1]."""
-        return self._sine_and_cosine(x)[0]
+        return self._both(x)[0]
 
     def cos(self, x: Name) -> Name:
         """Cosine, like ``sin``."""
-        return self._sine_and_cosine(x)[1]
+        return self._both(x)[1]
+
+    def _both(self, x: Name) -> list[Name]:
+        """Sine and cosine, computed once for each argument."""
+        if x not in self._sin_cos:
+            self._sin_cos[x] = self._call_own("sine_and_cosine", VectorWriter._sine_and_cosine, x)
+        return self._sin_cos[x]
 
     def _atan_of_quotient(self, numerator: Name, denominator: Name) -> Name:
         """``atan(n / d)`` for 0 <= n <= d and d > 0, in [0, pi/4], with a single division.
@@ -329,4 +348,26 @@ class VectorWriter:
         if operation in ("less", "less_equal"):
             relation = "olt" if operation == "less" else "ole"
             return lambda a, b: self.compare(relation, a, b)
+        if operation in _FUNCTIONS:
+            method: Callable[..., Name] = getattr(VectorWriter, operation)
+            return lambda *x: self._call_own(operation, lambda *given: [method(*given)], *x)[0]
         return getattr(self, operation)  # type: ignore[no-any-return]
+
+    def _call_own(self, operation: str, write: Callable[..., list[Name]], *arguments: Name) -> list[Name]:
+        """Call the function of an operation; ``write`` writes its body to a writer, and returns its results."""
+        if operation not in self.functions:
+            body = VectorWriter(self.bits, self.lanes)
+            names = [f"%x{k}" for k in range(len(arguments))]
+            results = write(body, *names)
+            kind, value = f"{{ {', '.join(self.type for _ in results)} }}", "poison"
+            for k, result in enumerate(results):
+                value = body.write(f"insertvalue {kind} {value}, {self.type} {result}, {k}")
+            head = f"define internal fastcc {kind} @{operation}({self._typed(names)}) noinline {{"
+            self.functions[operation] = Function(kind, len(results), [head, *body.lines, f"  ret {kind} {value}", "}"])
+        kind, count, _ = self.functions[operation]
+        called = self.write(f"call fastcc {kind} @{operation}({self._typed(arguments)})")
+        return [self.write(f"extractvalue {kind} {called}, {k}") for k in range(count)]
+
+    def _typed(self, names: Sequence[Name]) -> str:
+        """Arguments of a call or a definition."""
+        return ", ".join(f"{self.type} {name}" for name in names)

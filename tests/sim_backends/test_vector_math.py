@@ -10,6 +10,7 @@ import pytest
 
 from sim_backends.compiled.machine_code import compile_function, vector_length
 from sim_backends.compiled.tracing import Tracer
+from sim_backends.compiled.vector_math import VectorWriter
 
 LENGTH = 3001
 SPECIAL = (0.0, -0.0, 1e-30, -1e-30, 1e30, -1e30, math.inf, -math.inf, math.nan)
@@ -122,3 +123,15 @@ def test_rows_shorter_than_a_vector_are_refused():
     node = tracer.input("x")
     with pytest.raises(ValueError, match="at least"):
         compile_function([node], [node], np.dtype(np.float64)).run([np.zeros(1)], 1)
+
+
+def test_code_of_a_function_is_written_once():
+    """Code of a function at each call would multiply the time of the compiler."""
+    writer = VectorWriter(32, 8)
+    for k in range(20):
+        writer.function("atan")(f"%x{k}")
+        writer.function("sin")(f"%x{k}")
+        writer.function("cos")(f"%x{k}")
+    assert len(writer.lines) == 20 * 5  # a call and its result; a call and the sine and the cosine
+    definitions = [line for line in writer.declarations() if line.startswith("define ")]
+    assert len(definitions) == 2
