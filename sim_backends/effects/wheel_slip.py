@@ -21,6 +21,7 @@ MIN_INERTIA_KGM2 = 1e-9
 """Inertias below this value are inactive: the wheels transmit the drive force, as in the base model [kg m2]."""
 SUBSTEPS = 4
 _NEWTON_STEPS = 6
+_HALLEY_STEPS = 3
 MAX_STIFFNESS_N = 1e5
 _MIN_GRIP_N = 1e-6
 _SLIP_SPEED, _RIM_ACCELERATION = "longitudinal_slip.slip_speed", "longitudinal_slip.rim_acceleration"
@@ -174,9 +175,17 @@ def step_wheels(
 
 
 def _root(ops: Ops, q: Value, c: Value) -> Value:
-    """Solve ``z + q tanh z = c`` for z by Newton's method, which converges monotonically from this start."""
-    z = ops.where(ops.abs(c) < 1.0 + q, c / (1.0 + q), c - ops.sign(c) * q)
-    for _ in range(_NEWTON_STEPS):
+    """Solve ``z + q tanh z = c`` for z by Halley's method, for q >= 0.
+
+    It starts from the series of the solution to third order, or beyond its range from ``tanh z = 1``. The error of
+    ``tanh z`` is below 4e-4, for q < 100 below 2e-8, and below 1e-14 if ``|c|`` differs from ``1 + q`` by 10 %.
+    """
+    linear, size = c / (1.0 + q), ops.abs(c)
+    series = linear * (1.0 + linear * linear * q / (3.0 * (1.0 + q)))
+    z = ops.where(size < 1.0 + q, series, c - ops.sign(c) * q)
+    for _ in range(_HALLEY_STEPS):
         t = ops.tanh(z)
-        z = z - (z + q * t - c) / (1.0 + q * (1.0 - t * t))
+        slope = q * (1.0 - t * t)
+        error = z + q * t - c
+        z = z - error * (1.0 + slope) / ((1.0 + slope) * (1.0 + slope) + error * slope * t)
     return z

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from carlab.core.quantities import Action, CarState
-from sim_backends.array_ops import FLOATS
+from sim_backends.array_ops import ARRAYS, FLOATS
 from sim_backends.car_parameters import CarParameters, SimulatorConfig
 from sim_backends.dynamics.single_track import SingleTrack
+from sim_backends.effects.wheel_slip import _root
 from sim_backends.plant import Plant
 
 P = CarParameters()
@@ -280,6 +281,21 @@ def test_wheel_slip_is_stable_and_keeps_momentum(inertia, stiffness):
     coasting = np.array(speeds[200:])
     assert (np.abs(np.diff(coasting)) < 0.05).all()
     assert abs(coasting[-1]) <= abs(coasting[0]) + 1e-9
+
+
+def test_force_of_slipping_wheels_solves_the_implicit_step(rng):
+    """Against bisection: ``z + q tanh z = c`` of ``wheel_slip._root``, of which the force is ``tanh z``."""
+    q = 10.0 ** rng.uniform(-4.0, 7.0, 100_000)
+    c = (1.0 + q) * rng.uniform(-1.5, 1.5, len(q))
+    low, high = np.zeros(len(q)), np.abs(c)
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        is_above = middle + q * np.tanh(middle) > np.abs(c)
+        low, high = np.where(is_above, low, middle), np.where(is_above, middle, high)
+    error = np.abs(np.tanh(_root(ARRAYS, q, c)) - np.copysign(np.tanh(high), c))
+    assert error.max() < 4e-4
+    assert error[q < 100.0].max() < 2e-8
+    assert error[np.abs(np.abs(c) / (1.0 + q) - 1.0) > 0.1].max() < 1e-14
 
 
 def test_effects_of_body_forces_have_the_documented_signs():
