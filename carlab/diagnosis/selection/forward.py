@@ -8,11 +8,13 @@ paths (limited discrepancy search, Harvey and Ginsberg 1995, with one deviation 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.selection.candidates import accepted, next_candidates
 from carlab.diagnosis.selection.moves import apply_moves
@@ -23,6 +25,8 @@ log = logging.getLogger(__name__)
 
 ALTERNATIVES_PROGRESS = 0.9
 """Progress of the search while other choices are followed."""
+SAME_LOSS = 1e-3
+"""Share of the loss by which equal losses (S,) may differ: fits end at a finite distance from their minimum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +45,14 @@ class Path:
     history           (effect, fit) in the order of acceptance
     first_candidates  candidates for the first effect of this path
     alternatives      further accepted candidates of each step, not confusable with the one that was added
+    visited           sets of effects after each step
     """
 
     model: Model
     history: tuple[tuple[str, Fit], ...] = ()
     first_candidates: tuple[Candidate, ...] = ()
     alternatives: tuple[Choice, ...] = ()
+    visited: frozenset[frozenset[str]] = frozenset()
 
 
 def extend(
@@ -54,7 +60,7 @@ def extend(
 ) -> Path:
     """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets."""
     max_effects = problem.settings.selection.max_effects
-    while len(path.model.effects) < max_effects and not control.ends_search():
+    while len(path.model.effects) < max_effects and _set(path) not in visited and not control.ends_search():
         count = len(path.model.effects)
         control.progress(f"searching for effect {count + 1}", count / max_effects)
         candidates = next_candidates(problem, path.model, control)
@@ -62,22 +68,24 @@ def extend(
         chosen = accepted(problem, path.model, candidates, control)
         if not chosen or control.ends_search():
             break
-        before = frozenset(path.model.effects)
+        before = _set(path)
         path = _add(problem, path, chosen, control)
-        effects = frozenset(path.model.effects)
-        if effects == before or effects in visited:
+        if _set(path) == before:
             break
     return path
 
 
 def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunControl) -> Path:
-    """The greedy path, or the path with one other choice that predicts left-out blocks significantly better."""
+    """The greedy path, or the path with one other choice that predicts left-out blocks significantly better.
+
+    A path ends where it has the effects that an earlier path had after a step, because it would continue as that path.
+    """
     settings = problem.settings.selection
     if len(greedy.model.effects) < settings.min_effects_for_alternatives:
         return greedy
-    best, visited = greedy, {frozenset(greedy.model.effects)}
+    best, visited = greedy, set(greedy.visited)
     best_first = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.left_out_gain)
-    choices = best_first[: settings.max_alternatives]
+    choices = _distinct(best_first[: settings.max_alternatives])
     for k, choice in enumerate(choices):
         if remaining_excess(problem, base, best.model) < settings.min_remaining_excess or control.ends_search():
             break
@@ -85,11 +93,32 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
         log.info("alternative %d of %d: %s", k + 1, len(choices), ", ".join(names))
         labelled = _labelled(control, f"alternative {k + 1} of {len(choices)}")
         path = extend(problem, _add(problem, choice.path, (choice.candidate,), labelled), labelled, visited)
-        visited.add(frozenset(path.model.effects))
+        is_new = _set(path) not in visited
+        visited |= path.visited
+        if not is_new:
+            log.info("it continues as an earlier path: %s", ", ".join(path.model.effects))
+            continue
         if _is_better(problem, path.model, best.model):
             log.info("the alternative predicts left-out blocks better: %s", ", ".join(path.model.effects))
             best = path
     return best
+
+
+def _distinct(choices: Sequence[Choice]) -> list[Choice]:
+    """Choices without those that predict each left-out window as an earlier choice of the same path does.
+
+    Examples are a delay of both commands and a latency of motion capture.
+    """
+    found: list[Choice] = []
+    for choice in choices:
+        losses = (c.candidate.left_out_loss for c in found if c.path is choice.path)
+        if not any(_is_same(choice.candidate.left_out_loss, loss) for loss in losses):
+            found.append(choice)
+    return found
+
+
+def _is_same(loss: FloatArray, other: FloatArray) -> bool:
+    return bool(np.abs(loss - other).sum() <= SAME_LOSS * other.sum())
 
 
 def remaining_excess(problem: SearchProblem, base: Model, model: Model) -> float:
@@ -107,8 +136,16 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     confusable = problem.confusable.get(leader.effect, ())
     others = tuple(Choice(path, c) for c in chosen[1:] if c.effect not in confusable)
     return Path(
-        model, (*path.history, (leader.effect, model.fit)), path.first_candidates, (*path.alternatives, *others)
+        model,
+        (*path.history, (leader.effect, model.fit)),
+        path.first_candidates,
+        (*path.alternatives, *others),
+        path.visited | {frozenset(model.effects)},
     )
+
+
+def _set(path: Path) -> frozenset[str]:
+    return frozenset(path.model.effects)
 
 
 def _labelled(control: RunControl, label: str) -> RunControl:
