@@ -294,7 +294,8 @@ class Actuator(Resource):
         if not sender.is_alive():
             raise ActuatorFaultError(
                 status.fault
-                or f"The sender process has ended; the {name}'s own time-out stops the motor. Open the car again."
+                or f"The sender process has {sender.ending()}; the {name}'s own time-out stops the motor. "
+                "Open the car again."
             )
         if hangs:
             raise self._latch(
@@ -342,21 +343,31 @@ class Actuator(Resource):
         return status
 
     def _await_connection(self) -> None:
-        what = f"The {self.config.device_kind.name} at {self.config.address} is not ready"
         status = self._await(lambda s: s.is_link_open or s.is_ended, START_TIMEOUT_S)
-        if status.t_published_s == 0.0:
-            raise NotReadyError(
-                what, ("the sender process did not start; run 'python -m drivers.sender.process' by hand to see why.",)
-            )
-        if not status.is_link_open and not status.is_ended:
-            raise NotReadyError(
-                what, (f"it cannot be opened within {START_TIMEOUT_S:g} s; check its adapter, cable and network.",)
-            )
-        settled = (SenderState.CONNECTED, SenderState.FAULT)
-        status = self._await(lambda s: s.is_ended or s.state in settled, self.config.open_timeout_s)
-        if status.state == SenderState.CONNECTED:
-            return
-        raise NotReadyError(what, (status.fault or self._silence(status),))
+        if status.is_link_open and not status.is_ended:
+            settled = (SenderState.CONNECTED, SenderState.FAULT)
+            status = self._await(lambda s: s.is_ended or s.state in settled, self.config.open_timeout_s)
+            if status.state == SenderState.CONNECTED:
+                return
+        what = f"The {self.config.device_kind.name} at {self.config.address} is not ready"
+        raise NotReadyError(what, (status.fault or self._failure(status),))
+
+    def _failure(self, status: SenderStatus) -> str:
+        """Why the sender is not connected although it reports no fault: its end, or the step that took too long."""
+        sender = self._opened()
+        if status.is_ended:
+            sender.join(ANSWER_TIMEOUT_S)  # it publishes its last status shortly before it ends
+        has_started = status.t_published_s > 0.0
+        if ending := sender.ending():
+            step = f"waited for the {self.config.device_kind.name}" if status.is_link_open else "opened the link"
+            return f"the sender process {ending} while it {step if has_started else 'started'}."
+        if not has_started:
+            used_s = sender.processor_time_s()
+            effort = "" if math.isnan(used_s) else f"; it has used {used_s:.2g} s of processor time"
+            return f"the sender process has not started within {START_TIMEOUT_S:g} s{effort}. End other programs."
+        if not status.is_link_open:
+            return f"it cannot be opened within {START_TIMEOUT_S:g} s; check its adapter, cable and network."
+        return self._silence(status)
 
     def _silence(self, status: SenderStatus) -> str:
         kind = self.config.device_kind

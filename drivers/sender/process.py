@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import gc
 import json
+import math
 import os
 import signal
 import socket
@@ -27,10 +28,12 @@ from drivers.device import Device
 from drivers.device_kinds import DEVICE_KINDS, DeviceKind
 from drivers.sender.logic import ORDER_SIZE, Order
 from drivers.sender.loop import SenderLoop, parent_watch
-from drivers.sender.slots import Slot
+from drivers.sender.slots import Slot, anonymous_file
 from drivers.sender.status import STATUS_SIZE, SenderStatus
 
 REALTIME_PRIORITY = 20
+MAX_ERROR_CHARACTERS = 300
+"""Largest part of the last line of the sender's error output in a message."""
 
 
 class Sender(Protocol):
@@ -44,6 +47,12 @@ class Sender(Protocol):
 
     def is_alive(self) -> bool:
         """Whether the sender still runs."""
+
+    def ending(self) -> str:
+        """How the sender ended, such as "ended with status 1"; empty while it runs."""
+
+    def processor_time_s(self) -> float:
+        """Processor time that the sender has used [s]; NaN if it is unknown."""
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the sender to end; returns whether it has ended."""
@@ -88,15 +97,48 @@ class _Channel:
         self.statuses.close()
 
 
+class ErrorOutput:
+    """Error output of the sender, in memory: unlike a terminal or a disk, it does not make the sender wait."""
+
+    def __init__(self) -> None:
+        self.descriptor = anonymous_file("carlab-sender-errors")
+        self._lock = threading.Lock()
+        self._is_open = True
+
+    def last_line(self) -> str:
+        """Last line that is not empty: for an exception, its type and message. Empty after ``close``."""
+        with self._lock:
+            lines = self._text().strip().splitlines()
+        return lines[-1].strip()[-MAX_ERROR_CHARACTERS:] if lines else ""
+
+    def close(self) -> None:
+        """Copy the text to the error output of this process, and free it. Idempotent."""
+        with self._lock:
+            text = self._text()
+            if self._is_open:
+                self._is_open = False
+                os.close(self.descriptor)
+        if text and sys.stderr is not None:
+            with contextlib.suppress(OSError, ValueError):  # it is closed
+                sys.stderr.write(text)
+
+    def _text(self) -> str:
+        if not self._is_open:
+            return ""
+        return os.pread(self.descriptor, os.fstat(self.descriptor).st_size, 0).decode("utf-8", "replace")
+
+
 class SenderProcess:
     """The sender's process, started on construction; ``Actuator`` owns and closes it."""
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> None:
         self._channel = _Channel()
+        self._errors = ErrorOutput()
         try:
             self._process = self._start(config, calibration)
         except BaseException:
             self._channel.close()
+            self._errors.close()
             raise
         self._channel.sender_wake.close()
         self.pid = self._process.pid
@@ -117,6 +159,7 @@ class SenderProcess:
             [sys.executable, "-P", "-m", "drivers.sender.process", *map(str, descriptors), settings, str(os.getpid())],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
+            stderr=self._errors.descriptor,
             pass_fds=descriptors,
             start_new_session=True,
             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
@@ -133,6 +176,22 @@ class SenderProcess:
     def is_alive(self) -> bool:
         """Whether the process still runs."""
         return self._process.poll() is None
+
+    def ending(self) -> str:
+        """How the process ended, with the last line of its error output; empty while it runs."""
+        code = self._process.poll()
+        if code is None:
+            return ""
+        how = f"status {code}" if code >= 0 else f"signal {_signal_name(-code)}"
+        line = self._errors.last_line()
+        return f"ended with {how} ({line})" if line else f"ended with {how}"
+
+    def processor_time_s(self) -> float:
+        """Processor time of the main thread [s]; NaN if the system does not state it."""
+        try:
+            return int(Path(f"/proc/{self.pid}/schedstat").read_text(encoding="ascii").split()[0]) * 1e-9
+        except (OSError, ValueError, IndexError):
+            return math.nan
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the process to end."""
@@ -152,6 +211,7 @@ class SenderProcess:
             self._process.kill()
             self.join(2.0)
         self._channel.close()
+        self._errors.close()
 
 
 class SenderThread:
@@ -185,6 +245,14 @@ class SenderThread:
         """Whether the thread still runs."""
         return self._thread.is_alive()
 
+    def ending(self) -> str:
+        """Empty while the thread runs."""
+        return "" if self.is_alive() else "ended"
+
+    def processor_time_s(self) -> float:
+        """Unknown."""
+        return math.nan
+
     def join(self, timeout_s: float) -> bool:
         """Wait for the thread to end."""
         self._thread.join(timeout_s)
@@ -202,6 +270,13 @@ def start_sender(config: ActuatorConfig, calibration: ActuatorCalibration) -> Se
     if config.device_kind.is_bus and config.interface == "virtual":
         return SenderThread(config, calibration)
     return SenderProcess(config, calibration)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal
+        return str(number)
 
 
 def _try_realtime() -> bool:

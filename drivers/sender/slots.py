@@ -20,6 +20,14 @@ _CRC = struct.Struct("<I")
 READ_ATTEMPTS = 5
 
 
+def anonymous_file(name: str) -> int:
+    """Descriptor of a new file in memory, which no other program can open; ``name`` is for listings of the system."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create(name)
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
 class Slot:
     """One writer, any number of readers. Construct with ``create`` or, in the other process, ``attach``."""
 
@@ -34,11 +42,7 @@ class Slot:
     @classmethod
     def create(cls, capacity: int) -> Self:
         """Make a slot for values of at most ``capacity`` bytes."""
-        if hasattr(os, "memfd_create"):
-            descriptor = os.memfd_create("carlab-slot")
-        else:
-            with tempfile.TemporaryFile() as file:
-                descriptor = os.dup(file.fileno())
+        descriptor = anonymous_file("carlab-slot")
         try:
             os.ftruncate(descriptor, 2 * (_HEAD.size + capacity + _CRC.size))
             return cls(descriptor, capacity)
