@@ -146,7 +146,11 @@ class Drive:
         """Wait for the first motor command that is not neutral; the child prints its sender, except "no_close"."""
         if self.failure != "no_close":
             self.sender_pid = int(self.lines.readline().split()[1])
-        until(lambda: any(e.value == 3.0 for e in self.log.motor()))
+        try:
+            until(lambda: any(e.value == 3.0 for e in self.log.motor()))
+        except AssertionError:
+            self.process.kill()
+            pytest.fail(f"the car does not move; the child printed: {self.end()}")
 
     def end(self) -> str:
         """Wait for the child to end and return its remaining output."""
