@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import queue
 import socket
 import threading
@@ -27,6 +28,10 @@ from tests.helpers.rerun_files import cells, tabs
 
 def save_to(stream: Any, path: Path) -> None:
     stream.save(path)
+
+
+def write_priority(stream: Any, path: Path) -> None:
+    path.write_text(f"{os.getsid(0)} {os.getpriority(os.PRIO_PROCESS, 0)}")
 
 
 def hang(stream: Any) -> None:
@@ -58,6 +63,17 @@ def test_hanging_viewer_loses_documents_and_does_not_block(tmp_path: Path, monke
             view.report_activity("driving", step, 50)
             view.emit(step)  # type: ignore[arg-type]
         assert view.dropped >= 45
+
+
+def test_view_has_a_low_priority_and_its_own_session(tmp_path: Path) -> None:
+    """A session that mixes priorities can keep the sender from the processors."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    with LiveView(LiveSettings(tmp_path, 1, False, functools.partial(write_priority, path=tmp_path / "priority"))):
+        pass
+    assert os.getpriority(os.PRIO_PROCESS, 0) == before
+    session, niceness = map(int, (tmp_path / "priority").read_text().split())
+    assert session != os.getsid(0)
+    assert niceness == min(before + live_view.NICENESS, 19)
 
 
 def test_invalid_viewers_are_refused_before_the_car_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ class LiveView:
         self.dropped = 0
         context = multiprocessing.get_context("spawn")
         self._queue: Queue[Any] = context.Queue(capacity)
-        self._process = context.Process(target=show, args=(settings, self._queue), daemon=True, name="live view")
+        self._process = context.Process(target=_main, args=(settings, self._queue), daemon=True, name="live view")
 
     def emit(self, message: Document | EpisodeFigures | EpisodeCheck) -> None:
         """Pass a document of the control loop, or figures or a quick check of the newest episode."""
@@ -111,11 +111,21 @@ class LiveView:
             log.warning("The live view missed %d documents; the recordings have them.", self.dropped)
 
 
-def show(settings: LiveSettings, messages: Queue[Any]) -> None:
-    """Show messages until None arrives or the process of the run ends; the main function of the view's process."""
+def _main(settings: LiveSettings, messages: Queue[Any]) -> None:
+    """The main function of the view's process.
+
+    It has its own session: while a session mixes priorities, Linux 6.18.44 (``sched_autogroup``) can give the sender
+    and emulated cars, which have their own sessions, no processor for seconds.
+    """
     torch.set_num_threads(1)
-    if hasattr(os, "nice"):
+    if hasattr(os, "setsid"):
+        os.setsid()
         os.nice(NICENESS)
+    show(settings, messages)
+
+
+def show(settings: LiveSettings, messages: Queue[Any]) -> None:
+    """Show messages until None arrives or the process of the run ends."""
     stream = rr.RecordingStream("carlab", recording_id=settings.run.name)
     try:
         settings.connect(stream)
