@@ -67,7 +67,7 @@ def main() -> None:
     reality = nominal.with_values(CONCEALED)
     print(f"Learning to park in {options.episodes} episodes ({options.car} car; it differs from its car file)")
     learned = carlab.learn(
-        options.car, reality=reality, episodes=options.episodes, updates=options.updates,
+        options.car, reality=reality, episodes=options.episodes, prior="nominal", updates=options.updates,
         model_steps=options.model_steps, out=options.out, name="demo", hooks=progress_hooks(),
     )  # fmt: skip
     if not learned.is_complete:
