@@ -15,7 +15,9 @@ import numpy as np
 import torch
 
 from sim_backends import EFFECTS, SimulatorConfig, rollout
+from sim_backends.array_ops import FLOATS
 from sim_backends.effects import CATALOGUE
+from sim_backends.measurement import COMMAND_DELAY, MeasurementModel, delay_as_recorded_s
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,11 +40,14 @@ def commands() -> torch.Tensor:
 
 
 def drive(config: SimulatorConfig, values: dict[str, float]) -> NDArray[np.float64]:
-    """Return what motion capture reports (T + 1, 6) of the drive."""
+    """Return what motion capture reports (T + 1, 6) of the drive, which starts at rest."""
+    config = config.with_values(values)
+    numbers = config.values()
+    model = MeasurementModel(FLOATS, numbers, config.effects)
+    delay_s = delay_as_recorded_s(FLOATS, numbers, config.effects, model.latency_s)
     start = torch.zeros(1, 6, dtype=torch.float64)
-    measured = rollout(config, start, commands(), values=values, measured=True).measured
-    assert measured is not None
-    return measured[0].numpy()
+    states = rollout(config, start, commands(), values={COMMAND_DELAY: delay_s}).states[0]
+    return np.array(model.measure(states.tolist(), PERIOD_S))
 
 
 def draw(effect_id: str) -> None:

@@ -123,7 +123,7 @@ class _ArrayRollout:
         self.key = Key.of(kind, self.effects)
         as_tensors = {n: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for n, v in numbers.items()}
         delays_s = total_delays_s(as_tensors, self.effects)
-        self.plan: PeriodPlan = plan_period(self.period_s, delays_s, 0.0, max_step_s)
+        self.plan: PeriodPlan = plan_period(self.period_s, delays_s, max_step_s)
 
     def carried_at_start(self, start: FloatRow, past_states: FloatRow | None, before: int) -> FloatRow:
         """Carried rows at the first tick, hidden states simulated through the periods before it from steady state."""
@@ -175,7 +175,7 @@ class _ArrayRollout:
         """
         graph, periods, pieces = trace_step(key), first + np.arange(len(blocks)), self.plan.pieces
         parameters = self._rows(tuple(self.numbers[name] for name in graph.parameters))
-        steps = self._rows(tuple(as_array(piece.length_s / piece.steps) for piece in pieces))
+        steps = self._rows(tuple(as_array(piece.step_s) for piece in pieces))
         used: list[FloatRow] = [steps]  # the compiled code has their addresses only
         tables = []
         for k, piece in enumerate(pieces):

@@ -7,23 +7,15 @@ the cars are simulated in chunks that fit the cache. On a GPU, and for second de
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
 
-from carlab.core.planar import arc
 from sim_backends.array_ops import Value
 from sim_backends.batch.array_rollout import rollout_of_tensors
-from sim_backends.batch.inputs import (
-    Past,
-    check_shapes,
-    check_values,
-    number_if_shared,
-    total_delays_s,
-    with_effects_of_values,
-)
+from sim_backends.batch.inputs import Past, check_shapes, check_values, total_delays_s, with_effects_of_values
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.advance import Key, advance_tensors, trace_step
@@ -31,7 +23,6 @@ from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops
-from sim_backends.measurement import MeasurementModel, filter_step
 
 CARS_AT_ONCE = 4096
 """Cars per chunk on a CPU without a gradient."""
@@ -41,15 +32,12 @@ Engine = Literal["fastest", "operators"]
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """Trajectories of N cars over T commands.
+    """States (N, T + 1, 6) of N cars over T commands.
 
-    states    (N, T + 1, 6)  true x, y [m], yaw [rad] (not wrapped), vx, vy [m/s], yaw rate [rad/s]; 0 is the start
-    measured  (N, T + 1, 6)  measured states with observation effects and latency, without noise; None if not requested.
-                             Before the start the car moves at its first body velocity
+    They are true x, y [m], yaw [rad] (not wrapped), vx, vy [m/s], yaw rate [rad/s]; the first is the start.
     """
 
     states: torch.Tensor
-    measured: torch.Tensor | None = None
 
 
 def rollout(
@@ -61,7 +49,6 @@ def rollout(
     history_states: torch.Tensor | None = None,
     values: Mapping[str, Number] | None = None,
     t0_s: Number = 0.0,
-    measured: bool = False,
     max_step_s: float = MAX_STEP_S,
     engine: Engine = "fastest",
 ) -> Rollout:
@@ -78,7 +65,6 @@ def rollout(
         values: Numbers that replace those of ``config``, by dotted name (``tyre.front.mu``), each a number or a
             tensor of shape () or (N,). An effect with a value is added. Not ``timing.control_period``.
         t0_s: Time of the first tick since the first row of the recording [s], a number or of shape () or (N,).
-        measured: Also return measured states.
         max_step_s: Longest Runge-Kutta step [s].
         engine: "operators" uses torch's operators only, for ``torch.func`` and for second derivatives; "fastest"
             (first derivatives only) compiles the step if that is faster.
@@ -100,29 +86,20 @@ def rollout(
     needs_gradient = torch.is_grad_enabled() and any(isinstance(v, torch.Tensor) and v.requires_grad for v in inputs)
     may_compile = engine == "fastest" and start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
     if needs_gradient:
-        return _Batch(config, start, commands, past, given, t0_s, max_step_s, may_compile).run(measured)
+        return Rollout(_Batch(config, start, commands, past, given, t0_s, max_step_s, may_compile).run())
     at_once, parts = CARS_AT_ONCE if start.device.type == "cpu" else max(cars, 1), []
     with torch.no_grad():
         for first in range(0, max(cars, 1), at_once):
             cut = slice(first, first + at_once)
             own = {name: _of_cars(value, cut) for name, value in given.items()}
             chunk = (start[cut], commands[cut], past and past.cut(cut), own, _of_cars(t0_s, cut), max_step_s)
-            if may_compile and cars and not measured:
-                parts.append(Rollout(rollout_of_tensors(config, *chunk)))
-                continue
-            parts.append(_Batch(config, *chunk, may_compile).run(measured))
-    return _joined(parts)
+            compiled = may_compile and cars
+            parts.append(rollout_of_tensors(config, *chunk) if compiled else _Batch(config, *chunk, may_compile).run())
+    return Rollout(parts[0] if len(parts) == 1 else _concatenated(parts))
 
 
 def _of_cars(value: Number, cars: slice) -> Number:
     return value[cars] if isinstance(value, torch.Tensor) and value.ndim else value
-
-
-def _joined(parts: Sequence[Rollout]) -> Rollout:
-    if len(parts) == 1:
-        return parts[0]
-    measured = [part.measured for part in parts if part.measured is not None]
-    return Rollout(_concatenated([part.states for part in parts]), _concatenated(measured) if measured else None)
 
 
 def _concatenated(parts: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -130,29 +107,9 @@ def _concatenated(parts: Sequence[torch.Tensor]) -> torch.Tensor:
     return torch.cat([part.permute(1, 2, 0) for part in parts], dim=2).permute(2, 0, 1)
 
 
-class _Piece(NamedTuple):
-    """A piece of the period with its step lengths."""
-
-    start_s: Value
-    length_s: Value
-    step_s: Value
-    steps: int
-    has_capture: Value
-    capture_step_s: Value | None
-    capture_steps: int
-
-    @classmethod
-    def of(cls, piece: Piece) -> _Piece:
-        after = None if piece.capture_after_s is None else piece.capture_after_s / piece.capture_steps
-        start, length, step = piece.start_s, piece.length_s, piece.length_s / piece.steps
-        return cls(start, length, step, piece.steps, piece.has_capture, after, piece.capture_steps)
-
-
 class _Moment(NamedTuple):
     state: State
     memory: ActuatorState
-    filtered: State
-    """Measured velocities after the filter, if any."""
 
 
 class _Segment(NamedTuple):
@@ -165,8 +122,6 @@ class _Segment(NamedTuple):
     step_s: Value
     """Length of an integration step [s]."""
     steps: int
-    for_measurement: bool = False
-    """Whether the segment only leads to a capture: the next one starts where this one started."""
     body: Value | None = None
     """State of the body (6, cars) at the start; by default that at the end of the segment before."""
 
@@ -191,11 +146,10 @@ class _Batch:
         self.rows = tuple(row.contiguous() for row in start.unbind(dim=1))
         like = self.rows[0]
         self.numbers: dict[str, Number] = {**config.values(), **given}
-        self.ops = torch_ops(like)
+        ops = torch_ops(like)
         self.full = {name: self._row(value, like) for name, value in self.numbers.items()}
-        self.measurement = MeasurementModel(self.ops, self.full, config.effects)
-        self.model = SingleTrack(self.ops, config.kind, self.full, config.effects)
-        self.chain = ActuatorChain(self.ops, self.full, config.effects)
+        self.model = SingleTrack(ops, config.kind, self.full, config.effects)
+        self.chain = ActuatorChain(ops, self.full, config.effects)
         self.is_compiled = compiled
         self.t0_s = self._row(t0_s, like) if isinstance(t0_s, torch.Tensor) else t0_s
         self.past = 0 if past is None else int(past.commands.shape[1])
@@ -216,40 +170,18 @@ class _Batch:
         """Rows of six, one for each tick, as a tensor (ticks, 6, cars)."""
         return torch.stack([torch.stack(row) for row in rows])
 
-    def run(self, measured: bool) -> Rollout:
-        latency_s = MeasurementModel(self.ops, self.numbers, self.config.effects).latency_s if measured else 0.0
-        delays_s = total_delays_s(self.numbers, self.config.effects)
-        plan = plan_period(self.period_s, delays_s, number_if_shared(latency_s), self.max_step_s)
+    def run(self) -> torch.Tensor:
+        plan = plan_period(self.period_s, total_delays_s(self.numbers, self.config.effects), self.max_step_s)
         before = self.past if self.chain.has_memory or self.model.extra_states else 0
         acting = self._acting_commands(plan, before)
-        pieces = [_Piece.of(piece) for piece in plan.pieces]
-
-        lag_s = self.measurement.velocity_time_constant_s if measured else None
-        body: State = self.rows
-        extra, memory = self._initial_hidden_states(body, pieces, acting, before)
-        now = _Moment((*body, *extra), memory, self.measurement.observe(body)[3:6])
-        segments = list(self._segments(pieces, acting, before, measured))
-        ends = iter(self._advance(now, segments, lag_s))
-        trajectory, captured = [body], []
-        for _ in range(self.ticks):
-            seen = now.state[:6]
-            for piece in pieces:
-                at_capture = next(ends) if measured and piece.capture_step_s is not None else None
-                after = next(ends)
-                if measured and piece.has_capture is not False:
-                    moment = after if at_capture is None else at_capture
-                    seen = self._choose(piece.has_capture, self._measured_now(moment, lag_s), seen)
-                now = after
-            trajectory.append(now.state[:6])
-            captured.append(seen)
-        states = self._stacked(trajectory).permute(2, 0, 1)
-        if not measured:
-            return Rollout(states)
-        shown = self._delayed(self._stacked(captured) if captured else None, plan, latency_s)
-        return Rollout(states, torch.stack(shown).permute(2, 1, 0))
+        extra, memory = self._initial_hidden_states(self.rows, plan.pieces, acting, before)
+        start = _Moment((*self.rows, *extra), memory)
+        ends = self._advance(start, self._segments(plan.pieces, acting, before))
+        at_ticks = (start, *ends[len(plan.pieces) - 1 :: len(plan.pieces)])
+        return self._stacked([moment.state[:6] for moment in at_ticks]).permute(2, 0, 1)
 
     def _initial_hidden_states(
-        self, start: State, pieces: list[_Piece], acting: list[tuple[Value, ...]], before: int
+        self, start: State, pieces: Sequence[Piece], acting: list[tuple[Value, ...]], before: int
     ) -> tuple[State, ActuatorState]:
         """Hidden states of body and actuators at the first tick, simulated through the history.
 
@@ -268,12 +200,12 @@ class _Batch:
         extra = self.model.settled(t_s, ticks[0], actuation)
         if not before:
             return extra, memory
-        first = _Moment((*ticks[0], *extra), memory, ticks[0][3:6])
-        end = self._advance(first, list(self._history_segments(pieces, acting, self._stacked(ticks), t_s)), None)[-1]
+        first = _Moment((*ticks[0], *extra), memory)
+        end = self._advance(first, self._history_segments(pieces, acting, self._stacked(ticks), t_s))[-1]
         return end.state[6:], end.memory
 
     def _history_segments(
-        self, pieces: list[_Piece], acting: list[tuple[Value, ...]], ticks: Value, t_s: Value
+        self, pieces: Sequence[Piece], acting: list[tuple[Value, ...]], ticks: Value, t_s: Value
     ) -> Iterator[_Segment]:
         """The pieces of the periods between the states ``ticks`` (n, 6, cars), each from the interpolated state."""
         shares = [piece.start_s * (1.0 / self.period_s) for piece in pieces]
@@ -283,51 +215,34 @@ class _Batch:
                 begin_s = t_s + k * self.period_s + piece.start_s
                 yield _Segment(begin_s, (commands[0][k], commands[1][k]), piece.step_s, piece.steps, body=body[k])
 
-    def _segments(
-        self, pieces: list[_Piece], acting: list[tuple[Value, ...]], before: int, measured: bool
-    ) -> Iterator[_Segment]:
-        """The pieces of all periods, each after its part up to the capture if that is to be measured."""
+    def _segments(self, pieces: Sequence[Piece], acting: list[tuple[Value, ...]], before: int) -> Iterator[_Segment]:
+        """The pieces of all periods."""
         for k in range(self.ticks):
             for piece, commands in zip(pieces, acting, strict=True):
                 held = commands[0][before + k], commands[1][before + k]
-                t_s = self.t0_s + k * self.period_s + piece.start_s
-                if measured and piece.capture_step_s is not None:
-                    yield _Segment(t_s, held, piece.capture_step_s, piece.capture_steps, for_measurement=True)
-                yield _Segment(t_s, held, piece.step_s, piece.steps)
+                yield _Segment(self.t0_s + k * self.period_s + piece.start_s, held, piece.step_s, piece.steps)
 
-    def _advance(self, now: _Moment, segments: Sequence[_Segment], lag_s: Value | None) -> list[_Moment]:
-        """Integrate the car, and the filter on its measured velocities if any; the ends of the segments."""
+    def _advance(self, now: _Moment, segments: Iterable[_Segment]) -> list[_Moment]:
+        """Integrate the car; the ends of the segments."""
         by_segment = self._by_compiled_code if self.is_compiled else self._by_operators
         ends = []
         for segment in segments:
-            start = now if segment.body is None else now._replace(state=(*segment.body, *now.state[6:]))
-            end = by_segment(start, segment, lag_s)
-            ends.append(end)
-            now = now if segment.for_measurement else end
+            if segment.body is not None:
+                now = now._replace(state=(*segment.body, *now.state[6:]))
+            now = by_segment(now, segment)
+            ends.append(now)
         return ends
 
-    def _by_compiled_code(self, start: _Moment, segment: _Segment, lag_s: Value | None) -> _Moment:
-        key = Key.of(self.config.kind, self.config.effects, lag_s is not None)
-        states, memories = len(start.state), len(start.memory)
-        carried = (*start.state, *start.memory, *(start.filtered if key.has_filter else ()))
+    def _by_compiled_code(self, start: _Moment, segment: _Segment) -> _Moment:
+        key = Key.of(self.config.kind, self.config.effects)
         parameters = (self.full[name] for name in trace_step(key).parameters)
-        given = (*parameters, segment.step_s, *segment.commands, segment.t_s, *carried)
+        given = (*parameters, segment.step_s, *segment.commands, segment.t_s, *start.state, *start.memory)
         end = advance_tensors(key, segment.steps, *given)
-        return _Moment(end[:states], end[states : states + memories], end[-3:] if key.has_filter else end[3:6])
+        return _Moment(end[: len(start.state)], end[len(start.state) :])
 
-    def _by_operators(self, start: _Moment, segment: _Segment, lag_s: Value | None) -> _Moment:
-        t_s, commands, step_s, steps, _, _ = segment
-        moment = start
-        for i in range(steps):
-            state, memory = integrate_held(
-                self.model, self.chain, t_s + i * step_s, moment.state, moment.memory, commands, step_s, 1
-            )
-            filtered = state[3:6]
-            if lag_s is not None:
-                first, last = (self.measurement.observe(s[:6])[3:6] for s in (moment.state, state))
-                filtered = filter_step(self.ops, moment.filtered, first, last, step_s, lag_s)
-            moment = _Moment(state, memory, filtered)
-        return moment
+    def _by_operators(self, start: _Moment, segment: _Segment) -> _Moment:
+        t_s, commands, step_s, steps, _ = segment
+        return _Moment(*integrate_held(self.model, self.chain, t_s, *start, commands, step_s, steps))
 
     def _acting_commands(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Steering and throttle acting in each piece of each period, each (before + ticks, cars)."""
@@ -345,35 +260,6 @@ class _Batch:
             )
             for piece in plan.pieces
         ]
-
-    def _measured_now(self, moment: _Moment, lag_s: Value | None) -> State:
-        """Measured state at an instant, without latency."""
-        seen = self.measurement.observe(moment.state[:6])
-        return seen if lag_s is None else (*seen[:3], *moment.filtered)
-
-    def _choose(self, which: Value, yes: State, no: State) -> State:
-        if isinstance(which, bool):
-            return yes if which else no
-        return tuple(self.ops.where(which, a, b) for a, b in zip(yes, no, strict=True))
-
-    def _delayed(self, captured: torch.Tensor | None, plan: PeriodPlan, latency_s: Number) -> tuple[torch.Tensor, ...]:
-        """Six rows (ticks + 1, cars) of the newest measured states that have arrived at each tick."""
-        like = self.rows[0]
-        tick = torch.arange(self.ticks + 1, device=like.device)[:, None]
-        x, y, yaw, vx, vy, yaw_rate = self.rows
-        dt = tick.to(like.dtype) * self.period_s - self._row(latency_s, like)
-        forward, left, turn = arc(vx, vy, yaw_rate, dt)
-        sin, cos = torch.sin(yaw), torch.cos(yaw)
-        earlier: tuple[torch.Tensor, ...] = (x + cos * forward - sin * left, y + sin * forward + cos * left, yaw + turn)
-        earlier += tuple(v.expand_as(dt) for v in (vx, vy, yaw_rate))
-        earlier = MeasurementModel(torch_ops(dt), self.full, self.config.effects).observe(earlier)
-        if captured is None:
-            return earlier
-        index = (tick - 1 - plan.capture_periods).expand(-1, len(like))
-        return tuple(
-            torch.where(index >= 0, torch.gather(row, 0, index.clamp_min(0)), early)
-            for row, early in zip(captured.unbind(dim=1), earlier, strict=True)
-        )
 
 
 def _either(which: bool | torch.Tensor, yes: torch.Tensor, no: torch.Tensor) -> torch.Tensor:

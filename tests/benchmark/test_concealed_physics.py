@@ -16,7 +16,8 @@ from carlab.benchmark.world.base_car import BaseCar, Kind
 from carlab.benchmark.world.measurement import Noise, record
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, drive
-from sim_backends import EFFECTS, SimulatorConfig, rollout
+from sim_backends import EFFECTS, SimulatorConfig
+from tests.helpers.measured_rollout import measured_rollout
 
 # Noise of motion capture (0.6 mm, 2 mrad) and of velocities differentiated from it.
 NOISE_FLOOR = np.array([6e-4, 6e-4, 2e-3, 0.01, 0.01, 0.03])
@@ -50,7 +51,7 @@ def simulator_rollout(
     config = SimulatorConfig.from_tables(tables)
     begin = torch.tensor([start], dtype=torch.float64)
     acting_commands = torch.tensor(table[None, :-1], dtype=torch.float64)
-    return rollout(config, begin, acting_commands, measured=True, max_step_s=0.002)
+    return measured_rollout(config, begin, acting_commands, max_step_s=0.002)
 
 
 def draw_of(car: BaseCar) -> Draw:

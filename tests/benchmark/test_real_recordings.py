@@ -18,8 +18,9 @@ from carlab.benchmark.real.runner import RealProof
 from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, real_results_page, score_comparison
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
-from sim_backends import SimulatorConfig, rollout
+from sim_backends import SimulatorConfig
 from sim_backends.effects import CATALOGUE
+from tests.helpers.measured_rollout import measured_rollout
 
 PERIOD_S = 1.0 / 30.0
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_comparison.py")))
@@ -50,8 +51,7 @@ def commands(seconds: float, seed: int = 0) -> np.ndarray:
 def simulated(sent: np.ndarray, config: SimulatorConfig = CAR) -> dict[str, np.ndarray]:
     """The noise-free recording of a car."""
     start = torch.tensor([[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    states = rollout(config, start, torch.from_numpy(sent)[None], measured=True).measured
-    assert states is not None
+    states = measured_rollout(config, start, torch.from_numpy(sent)[None]).measured
     rows = states[0].numpy()
     columns = [PERIOD_S * np.arange(len(rows)), *rows.T, *np.vstack([sent, sent[-1:]]).T]
     return dict(zip(COLUMNS, columns, strict=True))

@@ -45,6 +45,7 @@ from sim_backends.effects import (
     confusable_effects,
 )
 from sim_backends.plant import Plant
+from tests.helpers.measured_rollout import measured_rollout
 
 
 class CubicSteering(ActuatorEffect):
@@ -129,8 +130,7 @@ def recording(seed: int, seconds: float = 16.0) -> EpisodeData:
     sent = np.repeat(rng.uniform([-0.9, 0.1], [0.9, 0.4], (ticks // 10, 2)), 10, axis=0)
     config = SimulatorConfig(effects=TRUE, control_period_s=1.0 / 30.0)
     start = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
-    measured = rollout(config, start, torch.from_numpy(sent)[None], measured=True).measured
-    assert measured is not None
+    measured = measured_rollout(config, start, torch.from_numpy(sent)[None]).measured
     states = measured[0].numpy() + rng.normal(size=(ticks + 1, 6)) * [3e-4, 3e-4, 1e-3, 6e-3, 6e-3, 1e-2]
     return EpisodeData(np.arange(ticks + 1) / 30.0, states, sent, sent, np.zeros(ticks))
 
@@ -155,23 +155,21 @@ def test_all_engines_agree_on_a_new_effect(name: str, monkeypatch: pytest.Monkey
     config = SimulatorConfig(effects={name: TRUE[name]}, command_delay_s=0.0)
     start = torch.tensor([[0.2, 0.1, 0.3, 1.5, 0.1, 0.4]], dtype=torch.float64)
     commands = torch.tensor(np.random.default_rng(0).uniform(-0.8, 0.8, (1, 8, 2)))
-    arrays = rollout(config, start, commands, measured=True)
-    operators = rollout(config, start, commands, measured=True, engine="operators")
-    compiled = rollout(config, start, commands.clone().requires_grad_(), measured=True)
-    assert arrays.measured is not None
+    arrays = rollout(config, start, commands).states
+    operators = rollout(config, start, commands, engine="operators").states
+    compiled = rollout(config, start, commands.clone().requires_grad_()).states
     for other in (operators, compiled):
-        assert other.measured is not None
-        assert torch.allclose(arrays.states, other.states.detach(), rtol=0, atol=1e-12)
-        assert torch.allclose(arrays.measured, other.measured.detach(), rtol=0, atol=1e-12)
+        assert torch.allclose(arrays, other.detach(), rtol=0, atol=1e-12)
     plant = Plant(config)
     plant.reset(CarState(*start[0].tolist()), 0.0)
     for k, (steering, throttle) in enumerate(commands[0].tolist()):
         plant.command(k * config.control_period_s, Action(steering, throttle))
         state = plant.advance((k + 1) * config.control_period_s)
-        assert np.allclose(state.to_array(), arrays.states[0, k + 1].numpy(), rtol=0, atol=1e-10)
-    plain = rollout(SimulatorConfig(command_delay_s=0.0), start, commands, measured=True)
-    assert plain.measured is not None
-    assert (arrays.measured - plain.measured).abs().max() > 1e-3
+        assert np.allclose(state.to_array(), arrays[0, k + 1].numpy(), rtol=0, atol=1e-10)
+    with_effect, plain = (
+        measured_rollout(each, start, commands).measured for each in (config, SimulatorConfig(command_delay_s=0.0))
+    )
+    assert (with_effect - plain).abs().max() > 1e-3
 
 
 def test_gradients_of_new_effects_equal_finite_differences() -> None:
@@ -182,8 +180,7 @@ def test_gradients_of_new_effects_equal_finite_differences() -> None:
         key = f"effects.{name}.{parameter}"
 
         def loss(number: torch.Tensor, key: str = key) -> torch.Tensor:
-            found = rollout(SimulatorConfig(), start, commands, values={key: number}, measured=True).measured
-            assert found is not None
+            found = measured_rollout(SimulatorConfig(), start, commands, values={key: number}).measured
             return found.square().sum()
 
         leaf = torch.tensor([value], dtype=torch.float64, requires_grad=True)
@@ -255,8 +252,7 @@ def test_windows_with_a_velocity_effect_start_from_true_velocities() -> None:
         ticks = 120
         sent = np.tile([0.2, 0.4], (ticks, 1))
         start = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.0, 0.3]], dtype=torch.float64)
-        measured = rollout(config, start, torch.from_numpy(sent)[None], measured=True).measured
-        assert measured is not None
+        measured = measured_rollout(config, start, torch.from_numpy(sent)[None]).measured
         episode = EpisodeData(np.arange(ticks + 1) / 30.0, measured[0].numpy(), sent, sent, np.zeros(ticks))
         windows = cut_windows(segments_of([episode]), 0.5, 0.5)
         for variant in (windows, as_recorded(windows)):

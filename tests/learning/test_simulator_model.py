@@ -14,6 +14,7 @@ from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import transitions_of
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
+from tests.helpers.measured_rollout import measured_rollout
 
 QUIET = MocapParameters(latency_s=0.0)
 HISTORY = 4
@@ -25,8 +26,8 @@ def drive(config: SimulatorConfig, ticks: int = 60, seed: int = 0, *, measured: 
     sent = np.repeat(rng.uniform(-1, 1, size=(ticks // 6, 2)), 6, axis=0)
     sent[:, 1] = np.abs(sent[:, 1])
     start = torch.tensor([[0.3, -0.2, 0.7, 1.5, 0.0, 0.0]], dtype=torch.float64)
-    out = rollout(config, start, torch.from_numpy(sent[None]), measured=measured)
-    states = (out.measured if measured else out.states)[0].numpy()
+    given = (config, start, torch.from_numpy(sent[None]))
+    states = (measured_rollout(*given).measured if measured else rollout(*given).states)[0].numpy()
     return EpisodeData(np.arange(len(sent) + 1) * config.control_period_s, states, sent, sent, np.zeros(len(sent)))
 
 

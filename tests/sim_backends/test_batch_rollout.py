@@ -15,6 +15,7 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.dynamics.plain_loop import rollout_one_by_one
 from sim_backends.effects import EFFECTS
 from sim_backends.plant import Plant
+from tests.helpers.measured_rollout import measured_rollout
 
 LAGS = {
     "steering_lag": {"time_constant": 0.07},
@@ -113,11 +114,10 @@ def test_compiled_step_agrees_with_operators():
     start, commands = some(7, 12)
     mu = torch.linspace(0.3, 0.5, 7, dtype=torch.float64)
     results = [
-        rollout(config, start, commands, values={"tyre.front.mu": mu}, measured=True, engine=engine)
+        rollout(config, start, commands, values={"tyre.front.mu": mu}, engine=engine).states
         for engine in ("fastest", "operators")
     ]
-    for name in ("states", "measured"):
-        assert torch.allclose(getattr(results[0], name), getattr(results[1], name), atol=1e-11)
+    assert torch.allclose(*results, atol=1e-11)
 
 
 def test_per_car_parameters_equal_single_rollouts():
@@ -177,7 +177,7 @@ def test_no_autograd_graph_without_a_required_gradient():
     commands.requires_grad_()
     assert rollout(SimulatorConfig(), start, commands).states.grad_fn is not None
     with torch.no_grad():
-        assert rollout(SimulatorConfig(), start, commands, measured=True).measured.grad_fn is None
+        assert rollout(SimulatorConfig(), start, commands).states.grad_fn is None
 
 
 def all_effects():
@@ -198,17 +198,16 @@ def test_gradients_equal_finite_differences_for_each_number(kind):
     inputs = [start, commands, history, *numbers.values()]
 
     def losses(*tensors):
-        out = rollout(
+        states = rollout(
             config,
             tensors[0],
             tensors[1],
             history=tensors[2],
             values=dict(zip(names, tensors[3:], strict=True)),
-            measured=True,
             max_step_s=0.005,
-        )
+        ).states
         weights = torch.linspace(0.5, 1.5, 5 * 6, dtype=torch.float64).reshape(5, 6)
-        return ((out.states + 0.7 * out.measured) * weights).sum(dim=(1, 2))
+        return (states * weights).sum(dim=(1, 2))
 
     leaves = [t.clone().requires_grad_() for t in inputs]
     losses(*leaves).sum().backward()
@@ -239,7 +238,7 @@ def test_gradient_by_a_shared_number_is_the_sum_over_cars():
 @functools.cache
 def without_effects(kind):
     """Return the rollout of a car without effects."""
-    return rollout(SimulatorConfig(kind=kind), *some(5, 12), measured=True)
+    return measured_rollout(SimulatorConfig(kind=kind), *some(5, 12))
 
 
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"tyre_saturation"}))  # these kinds have Pacejka tyres already
@@ -248,30 +247,10 @@ def test_each_effect_of_typical_size_changes_the_measured_states(name, kind):
     """An effect at its identity changes nothing: ``test_effects_everywhere``."""
     (start, commands), plain = some(5, 12), without_effects(kind)
     typical = {p.name: p.typical for p in EFFECTS[name].parameters}
-    strong = rollout(SimulatorConfig(kind=kind, effects={name: typical}), start, commands, measured=True)
+    strong = measured_rollout(SimulatorConfig(kind=kind, effects={name: typical}), start, commands)
     assert (plain.measured - strong.measured).abs().max() > 1e-4
     if EFFECTS[name].kind == "observation":
         assert torch.equal(plain.states, strong.states)
-
-
-@pytest.mark.parametrize("latency_s", [0.0, 0.008, 1 / 30, 0.05, 0.1])
-def test_measured_states_are_older_by_the_latency(latency_s):
-    start, commands = some(2, 200)
-    config = SimulatorConfig(control_period_s=0.002, effects={"mocap_latency": {"latency": latency_s}})
-    out = rollout(config, start, commands, measured=True)
-    for k in range(120, 200):
-        at = k - latency_s / 0.002
-        low = math.floor(at + 1e-9)
-        share = at - low
-        between = (1 - share) * out.states[:, low] + share * out.states[:, min(low + 1, 200)]
-        assert (out.measured[:, k] - between).abs().max() < 1e-4
-
-
-def test_measured_states_before_the_start_extrapolate_the_first_velocity():
-    start = torch.tensor([[1.0, 2.0, 0.5, 2.0, 0.0, 0.0]], dtype=torch.float64)
-    config = SimulatorConfig(effects={"mocap_latency": {"latency": 0.1}})
-    first = rollout(config, start, torch.zeros(1, 4, 2, dtype=torch.float64), measured=True).measured[0, 0]
-    assert first[:3].tolist() == pytest.approx([1 - 0.2 * math.cos(0.5), 2 - 0.2 * math.sin(0.5), 0.5])
 
 
 def test_marker_offset_changes_position_and_velocity_consistently():
@@ -282,7 +261,7 @@ def test_marker_offset_changes_position_and_velocity_consistently():
     )
     start, _ = some(1, 1)
     commands = torch.full((1, 400, 2), 0.4, dtype=torch.float64)
-    measured_states = rollout(config, start, commands, measured=True).measured[0].numpy()
+    measured_states = measured_rollout(config, start, commands).measured[0].numpy()
     world = (measured_states[2:, :2] - measured_states[:-2, :2]) / 0.002
     yaw = measured_states[1:-1, 2]
     vx = np.cos(yaw) * world[:, 0] + np.sin(yaw) * world[:, 1]
@@ -297,7 +276,7 @@ def test_velocity_filter_is_a_first_order_lag_on_velocities_only():
         SimulatorConfig(effects={"mocap_latency": {"latency": 0.0}, "velocity_filter_lag": {"time_constant": 0.05}}),
     )
     start = torch.tensor([[0, 0, 0, 2.0, 0, 0]], dtype=torch.float64)
-    out = rollout(config, start, torch.zeros(1, 30, 2, dtype=torch.float64), measured=True)
+    out = measured_rollout(config, start, torch.zeros(1, 30, 2, dtype=torch.float64))
     t = np.arange(31) * config.control_period_s
     rate = config.parameters.damping_nspm / config.parameters.mass_kg
     # Response of a lag at v(0) = 2 to v = 2 exp(-rate t).
@@ -342,18 +321,10 @@ def test_invalid_input_is_refused():
 
 def test_empty_commands_and_commands_of_another_dtype_are_accepted():
     start, commands = some(3, 5)
-    empty = rollout(SimulatorConfig(), start, commands[:, :0], measured=True)
-    assert torch.equal(empty.states[:, 0], start)
-    assert empty.measured.shape == (3, 1, 6)
+    empty = rollout(SimulatorConfig(), start, commands[:, :0]).states
+    assert torch.equal(empty, start[:, None])
     mixed = rollout(SimulatorConfig(), start, commands.float(), history=commands.float()).states
     assert mixed.dtype == torch.float64
-
-
-def test_measuring_does_not_change_the_trajectory():
-    start, commands = some(3, 10)
-    config = SimulatorConfig(effects=all_effects())
-    states = rollout(config, start, commands, measured=True).states
-    assert torch.equal(states, rollout(config, start, commands).states)
 
 
 @pytest.mark.gpu
@@ -361,8 +332,7 @@ def test_measuring_does_not_change_the_trajectory():
 def test_cuda_agrees_with_the_cpu():
     start, commands = some(16, 20)
     config = SimulatorConfig(effects=all_effects())
-    cpu = rollout(config, start, commands, measured=True)
-    gpu = rollout(config, start.cuda(), commands.cuda(), measured=True)
-    assert gpu.states.device.type == "cuda"
-    assert torch.allclose(gpu.states.cpu(), cpu.states, atol=1e-9)
-    assert torch.allclose(gpu.measured.cpu(), cpu.measured, atol=1e-9)
+    cpu = rollout(config, start, commands).states
+    gpu = rollout(config, start.cuda(), commands.cuda()).states
+    assert gpu.device.type == "cuda"
+    assert torch.allclose(gpu.cpu(), cpu, atol=1e-9)

@@ -44,10 +44,10 @@ def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_
         delay = torch.linspace(0.02, 0.09, cars, dtype=torch.float64, requires_grad=True)
         mu = torch.linspace(0.3, 0.5, cars, dtype=torch.float64, requires_grad=True)
         values = {"tyre.front.mu": mu, **({"timing.command_delay": delay} if per_car_delay else {})}
-        out = rollout(config, start, commands, values=values, measured=True, max_step_s=0.02, engine=engine)
-        (out.states.square().sum() + out.measured[:, 3:].sum()).backward()
+        states = rollout(config, start, commands, values=values, max_step_s=0.02, engine=engine).states
+        states.square().sum().backward()
         grads = [start.grad, commands.grad, *([mu.grad] if mu.grad is not None else [])]
-        results.append([out.states.detach(), out.measured.detach(), *grads, *([delay.grad] if per_car_delay else [])])
+        results.append([states.detach(), *grads, *([delay.grad] if per_car_delay else [])])
     for compiled, reference in zip(*results, strict=True):
         assert torch.allclose(compiled, reference, rtol=1e-9, atol=1e-10)
 
@@ -91,13 +91,10 @@ def test_a_car_has_the_same_states_and_gradients_in_a_batch_of_any_size(dtype):
             assert torch.equal(part, all_cars[:cars])
 
 
-@pytest.mark.parametrize("measured", [False, True])
 @pytest.mark.parametrize("needs_gradient", [False, True])
-def test_batch_without_cars_has_no_states(needs_gradient, measured):
+def test_batch_without_cars_has_no_states(needs_gradient):
     start, commands = some(0, 3)
-    out = rollout(SimulatorConfig(), start, commands.requires_grad_(needs_gradient), measured=measured)
-    assert out.states.shape == (0, 4, 6)
-    assert not measured or out.measured.shape == (0, 4, 6)
+    assert rollout(SimulatorConfig(), start, commands.requires_grad_(needs_gradient)).states.shape == (0, 4, 6)
 
 
 def test_batches_of_several_threads_do_not_disturb_each_other():

@@ -16,6 +16,7 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS, MeasuredCurve
 from sim_backends.plant import Plant
 from tests.helpers.effect_inputs import NAMES, past, some, typical
+from tests.helpers.measured_rollout import measured_rollout
 
 IDS = [
     "command_delay",
@@ -87,8 +88,8 @@ def with_gradients(names, engine):
     (start, commands), history = some(), past()
     commands[:, 2] = 0.0  # the kink of a dead band and a power
     leaves = [t.requires_grad_() for t in (start, commands, history)]
-    options = {"measured": True, "t0_s": 2.0, "max_step_s": 0.02, "engine": engine}
-    out = rollout(config, start, commands, history=history, values=values, **options)
+    options = {"t0_s": 2.0, "max_step_s": 0.02, "engine": engine}
+    out = measured_rollout(config, start, commands, history=history, values=values, **options)
     (out.states.square().sum() + out.measured.square().sum()).backward()
     return out, leaves, values
 
@@ -111,13 +112,13 @@ def test_effects_at_their_identity_change_neither_states_nor_gradients(names, en
 @functools.cache
 def without_effects(kind):
     """Return the rollout of a car without effects."""
-    return rollout(SimulatorConfig(kind=kind), *some(), measured=True)
+    return measured_rollout(SimulatorConfig(kind=kind), *some())
 
 
 def is_changed(kind, names):
     """Whether effects at their identity change the rollout of a car."""
     plain = without_effects(kind)
-    same = rollout(SimulatorConfig(kind=kind, effects={name: {} for name in names}), *some(), measured=True)
+    same = measured_rollout(SimulatorConfig(kind=kind, effects={name: {} for name in names}), *some())
     return bool(max((getattr(plain, k) - getattr(same, k)).abs().max() for k in ("states", "measured")) > 1e-12)
 
 
@@ -143,7 +144,7 @@ CHOICES = [
 @pytest.mark.parametrize("kind", ["dynamic", "kinematic", "linear_tyre", "blend"])
 def test_identity_of_the_numbers_holds_for_each_choice(name, choice, word, kind):
     plain = without_effects(kind)
-    same = rollout(SimulatorConfig(kind=kind, effects={name: {choice: word}}), *some(), measured=True)
+    same = measured_rollout(SimulatorConfig(kind=kind, effects={name: {choice: word}}), *some())
     assert (plain.states - same.states).abs().max() <= 1e-12
 
 
@@ -194,11 +195,11 @@ def test_per_car_effect_parameters_equal_single_rollouts(name):
         each = [p.typical * s for s in shares] if not p.choices else [0.0, 1.0, 1.0, 0.0]
         values[f"effects.{name}.{p.name}"] = torch.tensor(each, dtype=torch.float64)
     drawn = {"t0_s": torch.tensor([0.0, 5.0, 10.0, 0.0], dtype=torch.float64)}
-    together = rollout(SimulatorConfig(), start, commands, values=values, measured=True, max_step_s=0.005, **drawn)
+    together = measured_rollout(SimulatorConfig(), start, commands, values=values, max_step_s=0.005, **drawn)
     for i in range(4):
         config = SimulatorConfig().with_values({k: float(v[i]) for k, v in values.items()})
         t0_s = float(drawn["t0_s"][i])
-        alone = rollout(config, start[i : i + 1], commands[i : i + 1], measured=True, max_step_s=0.005, t0_s=t0_s)
+        alone = measured_rollout(config, start[i : i + 1], commands[i : i + 1], max_step_s=0.005, t0_s=t0_s)
         assert torch.allclose(alone.states[0], together.states[i], atol=1e-6)
         assert torch.allclose(alone.measured[0], together.measured[i], atol=1e-6)
 
@@ -219,7 +220,7 @@ def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
         copies = len(next(iter(values.values())))
         repeated = (t.repeat(copies, *[1] * (t.ndim - 1)) for t in (start, commands, history))
         s, c, h = repeated
-        out = rollout(base, s, c, history=h, values=values, measured=True, t0_s=3.0)
+        out = measured_rollout(base, s, c, history=h, values=values, parts=7, t0_s=3.0)
         weights = torch.linspace(0.5, 1.5, 42, dtype=torch.float64).reshape(7, 6)
         return ((out.states + 0.6 * out.measured) * weights).sum(dim=(1, 2))
 
@@ -281,17 +282,16 @@ FLIP = torch.tensor([1, -1, -1, 1, -1, -1], dtype=torch.float64)
 @pytest.mark.parametrize("name", NAMES)
 def test_mirror_symmetry(name):
     start, commands = some()
-    original = rollout(SimulatorConfig(effects={name: typical(name)}), start, commands, history=past(), measured=True)
+    original = measured_rollout(SimulatorConfig(effects={name: typical(name)}), start, commands, history=past())
     other = {k: -v if k in MIRRORED.get(name, ()) else v for k, v in typical(name).items()}
     if name == "steering_curve":
         other = {k: -v for k, v in zip(other, reversed(other.values()), strict=True)}
     mirror = torch.tensor([-1.0, 1.0], dtype=torch.float64)
-    image = rollout(
+    image = measured_rollout(
         SimulatorConfig(effects={name: other}),
         start * FLIP,
         commands * mirror,
         history=past() * mirror,
-        measured=True,
     )
     assert torch.allclose(original.states, image.states * FLIP, rtol=0, atol=1e-11)
     assert torch.allclose(original.measured, image.measured * FLIP, rtol=0, atol=1e-11)
@@ -317,7 +317,7 @@ def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
         )
     if name in ("road_slope", "wind"):
         moved_parameters["direction"] += angle
-    original = rollout(SimulatorConfig(effects={name: numbers}), start, commands, measured=True)
-    image = rollout(SimulatorConfig(effects={name: moved_parameters}), transformed(start), commands, measured=True)
+    original = measured_rollout(SimulatorConfig(effects={name: numbers}), start, commands)
+    image = measured_rollout(SimulatorConfig(effects={name: moved_parameters}), transformed(start), commands)
     assert torch.allclose(transformed(original.states), image.states, rtol=0, atol=1e-10)
     assert torch.allclose(transformed(original.measured), image.measured, rtol=0, atol=1e-10)

@@ -10,6 +10,7 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.plant import Plant
 from tests.helpers.effect_inputs import NAMES, past, some, typical
+from tests.helpers.measured_rollout import measured_rollout
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,7 +72,7 @@ def test_result_does_not_depend_on_the_listed_order_of_effects():
     backwards = dict(reversed(all_effects.items()))
     start, commands = some()
     start[0], start[1, 3] = 0.0, -1.5
-    one, other = (rollout(SimulatorConfig(effects=e), start, commands, measured=True) for e in (all_effects, backwards))
+    one, other = (measured_rollout(SimulatorConfig(effects=e), start, commands) for e in (all_effects, backwards))
     assert torch.allclose(one.states, other.states, rtol=0, atol=1e-9)
     assert torch.allclose(one.measured, other.measured, rtol=0, atol=1e-9)
     assert torch.isfinite(one.measured).all()
@@ -83,7 +84,7 @@ def test_yaw_misalignment_changes_only_measured_states():
     config = SimulatorConfig(
         effects={"mocap_latency": {"latency": 0.0}, "mocap_yaw_misalignment": {"angle": angle}, "marker_offset": {}}
     )
-    out = rollout(config, start, commands, measured=True)
+    out = measured_rollout(config, start, commands)
     true, measured = out.states, out.measured
     assert torch.allclose(measured[..., 2], true[..., 2] + angle)
     assert torch.allclose(measured[..., :2], true[..., :2])

@@ -39,8 +39,8 @@ from learning.posterior.residuals import fit_residuals
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import DELAY, CarModel, known_ranges
 from learning.world.history import HistoryChoice
-from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.measured_rollout import measured_rollout
 
 HISTORY = 5
 TRUTH = SimulatorConfig.from_preset().with_values(
@@ -57,8 +57,7 @@ def drive(seed: int, ticks: int = 240) -> EpisodeData:
     sent = np.repeat(rng.uniform(-1, 1, size=(ticks // 6, 2)), 6, axis=0)
     sent[:, 1] = 0.1 + 0.5 * np.abs(sent[:, 1])
     start = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
-    measured = rollout(TRUTH, start, torch.from_numpy(sent[None]), measured=True).measured
-    assert measured is not None
+    measured = measured_rollout(TRUTH, start, torch.from_numpy(sent[None])).measured
     states = measured[0].numpy() + rng.normal(size=(ticks + 1, 6)) * [3e-4, 3e-4, 1e-3, 5e-3, 5e-3, 0.02]
     return EpisodeData(np.arange(ticks + 1) * TRUTH.control_period_s, states, sent, sent, np.zeros(ticks))
 
