@@ -45,13 +45,12 @@ class MocapSensor:
     Args:
         config: Rate, noise, latency and share of lost frames; effects that change the latency.
         seed: Seed of the noise.
-        extra_latency_s: Additional latency, for example of a measured wire [s].
     """
 
-    def __init__(self, config: SimulatorConfig, seed: int = 0, *, extra_latency_s: float = 0.0) -> None:
+    def __init__(self, config: SimulatorConfig, seed: int = 0) -> None:
         self._mocap = config.mocap
         self._frame_rate_hz = frame_rate_hz(config)
-        self.latency_s = config.latency_s() + extra_latency_s
+        self.latency_s = config.latency_s()
         self.lost = 0
         self.seed(seed)
         self._start_s = 0.0

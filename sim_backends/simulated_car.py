@@ -51,8 +51,6 @@ class SimulatedCar(Car):
         clock: By default a simulated clock; with a ``MonotonicClock`` the car runs in real time.
         limits: Largest commands.
         watchdog_s: Time without a new command after which the car gets neutral [s].
-        extra_command_latency_s: Additional latency of commands, for example of a measured wire [s].
-        extra_pose_latency_s: Additional latency of poses [s].
         window_s: Window of the velocity fit [s].
     """
 
@@ -67,8 +65,6 @@ class SimulatedCar(Car):
         clock: Clock | None = None,
         limits: ActionLimits | None = None,
         watchdog_s: float = 0.15,
-        extra_command_latency_s: float = 0.0,
-        extra_pose_latency_s: float = 0.0,
         window_s: float = 0.05,
         name: str = "sim",
     ) -> None:
@@ -77,10 +73,9 @@ class SimulatedCar(Car):
         self.clock = SimulatedClock() if clock is None else clock
         self.limits = ActionLimits() if limits is None else limits
         self.watchdog_s = watchdog_s
-        self._extra_command_latency_s = extra_command_latency_s
         self._start = CarState() if start is None else start
         self._plant = Plant(self.config)
-        self._sensor = MocapSensor(self.config, seed, extra_latency_s=extra_pose_latency_s)
+        self._sensor = MocapSensor(self.config, seed)
         self._estimator = StateEstimator(window_s)
         self._velocities = _MeasuredVelocities(self.config)
         self._open = self._armed = False
@@ -222,12 +217,12 @@ class SimulatedCar(Car):
     def _send(self, action: Action) -> None:
         now_s = self.clock.now_s()
         self._run_watchdog(now_s)
-        self._plant.command(now_s + self._extra_command_latency_s, action)
+        self._plant.command(now_s, action)
         self._fresh_until_s = None if action.is_neutral else now_s + self.watchdog_s
 
     def _run_watchdog(self, now_s: float) -> None:
         if self._fresh_until_s is not None and now_s >= self._fresh_until_s:
-            self._plant.command(self._fresh_until_s + self._extra_command_latency_s, NEUTRAL)
+            self._plant.command(self._fresh_until_s, NEUTRAL)
             self._fresh_until_s = None
             self._watchdog_trips += 1
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,17 +58,14 @@ def test_same_policy_ends_at_the_same_state(emulated: EmulatedCar, latency: Late
     policy = ReverseParkingPolicy.for_car(default_car().simulator)
     # The median: one pause of a busy machine delays a third of the samples, and would shift the mean by 0.1 s.
     typical_s = {name: float(np.median(samples)) for name, samples in latency.parts.items()}
-    extra_pose_s = typical_s[EXPOSURE_TO_ARRIVAL] - default_car().simulator.mocap.latency_s
+    nominal = default_car().simulator
+    wire_s = typical_s[COMMAND_TO_WIRE] + typical_s[WIRE_TO_FIRMWARE]
+    mocap = replace(nominal.mocap, latency_s=max(typical_s[EXPOSURE_TO_ARRIVAL], nominal.mocap.latency_s))
+    with_measured_latencies = replace(nominal, command_delay_s=nominal.command_delay_s + wire_s, mocap=mocap)
     distances_m, yaw_differences_rad = [], []
     for seed in SEEDS:
         emulated_episode = drive(emulated, policy, seed)
-        simulated = SimulatedCar(
-            default_car().simulator,
-            seed=seed,
-            extra_command_latency_s=typical_s[COMMAND_TO_WIRE] + typical_s[WIRE_TO_FIRMWARE],
-            extra_pose_latency_s=max(extra_pose_s, 0.0),
-        )
-        with simulated:
+        with SimulatedCar(with_measured_latencies, seed=seed) as simulated:
             simulated_episode = drive(simulated, policy, seed)
         assert emulated_episode.ticks == simulated_episode.ticks == 100, emulated_episode.metadata
         end, expected = emulated_episode.states[-1], simulated_episode.states[-1]

@@ -198,25 +198,6 @@ def test_place_at_rest_leaves_no_pending_command():
         assert car.observe().state.to_array() == pytest.approx([1.0, 2.0, -1.0, 0, 0, 0], abs=1e-9)
 
 
-def test_wire_latencies_add_to_those_of_the_car_file():
-    def response(**extra):
-        with SimulatedCar(SimulatorConfig(mocap=QUIET), **extra) as car:
-            car.arm()
-            t0 = car.clock.now_s()
-            car.command(Action(0.0, 1.0))
-            car.clock.sleep_until(t0 + 0.12)
-            return car.true_state.vx_mps, car.observe()
-
-    fast, _ = response()
-    slow, _ = response(extra_command_latency_s=0.02)
-    p = SimulatorConfig().parameters
-    rate, top = p.damping_nspm / p.mass_kg, p.drive_gain_n / p.damping_nspm
-    assert fast == pytest.approx(top * (1 - math.exp(-rate * 0.04)), rel=1e-6)
-    assert slow == pytest.approx(top * (1 - math.exp(-rate * 0.02)), rel=1e-6)
-    _, late = response(extra_pose_latency_s=0.01)
-    assert late.t_receive_s - late.t_capture_s == pytest.approx(0.018)
-
-
 def test_loss_of_all_frames_is_reported():
     with (
         SimulatedCar(SimulatorConfig(mocap=MocapParameters(dropout=1.0))) as car,
