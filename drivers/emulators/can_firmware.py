@@ -1,23 +1,15 @@
-"""An emulated VESC on a CAN bus of python-can: ``virtual`` within a process, ``udp_multicast`` between processes.
-
-``python -m drivers.emulators.can_firmware --interface udp_multicast --channel 239.74.163.2`` runs it in a separate
-process, which ends when standard input ends.
-"""
+"""An emulated VESC on a CAN bus of python-can: ``virtual`` within a process, ``udp_multicast`` between processes."""
 
 from __future__ import annotations
 
-import argparse
 import struct
-import sys
 import threading
 import time
-from pathlib import Path
 
 import can
 
 from carlab.core.resource import Resource
 from drivers.config import MULTICAST_GROUP
-from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.links.can_link import open_bus
@@ -132,26 +124,3 @@ class CanFirmware(Resource):
         data = self.faults.transmit(frame.data)
         if not self.faults.drops_replies and data == frame.data:
             bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=True))
-
-
-def main() -> int:
-    """Serve until standard input ends."""
-    parser = argparse.ArgumentParser(description="Emulated VESC on a CAN bus.")
-    parser.add_argument("--interface", default="udp_multicast", help="python-can interface")
-    parser.add_argument("--channel", default=MULTICAST_GROUP, help="channel; GROUP or GROUP:PORT for udp_multicast")
-    parser.add_argument("--log", type=Path, help="log of commands and events as JSON lines")
-    parser.add_argument("--motor-timeout", type=float, default=1.0, help="motor time-out [s]")
-    parser.add_argument("--controller-id", type=int, default=23, help="id on the bus")
-    options = parser.parse_args()
-    firmware = VescFirmware(
-        CommandLog(options.log), motor_timeout_s=options.motor_timeout, controller_id=options.controller_id
-    )
-    with CanFirmware(firmware, options.interface, options.channel) as served:
-        sys.stdout.write(f"{served.interface} {served.channel} id {firmware.controller_id}\n")
-        sys.stdout.flush()
-        sys.stdin.buffer.read()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """An emulated VESC on a pseudo-terminal: a host opens its port like that of a real VESC.
 
-``python -m drivers.emulators.serial_firmware --link PATH --log FILE`` runs it in a separate process, which prints its
-port on standard output and ends when standard input ends.
+``python -m drivers.emulators.serial_firmware --link PATH`` runs it in a separate process, which prints its port on
+standard output and ends when standard input ends.
 """
 
 from __future__ import annotations
@@ -214,12 +214,7 @@ def main() -> int:
     """Serve until standard input ends."""
     parser = argparse.ArgumentParser(description="Emulated VESC on a pseudo-terminal.")
     parser.add_argument("--link", type=Path, help="symbolic link to the terminal")
-    parser.add_argument("--log", type=Path, help="log of commands and events as JSON lines")
-    parser.add_argument("--motor-timeout", type=float, default=1.0, help="motor time-out [s]")
-    parser.add_argument("--baud", type=int, help="line speed at which bytes are paced")
-    options = parser.parse_args()
-    firmware = VescFirmware(CommandLog(options.log), motor_timeout_s=options.motor_timeout)
-    with SerialFirmware(firmware, link=options.link, baud=options.baud) as served:
+    with SerialFirmware(VescFirmware(CommandLog()), link=parser.parse_args().link) as served:
         sys.stdout.write(served.port + "\n")
         sys.stdout.flush()
         sys.stdin.buffer.read()

@@ -39,6 +39,17 @@ pytestmark = pytest.mark.realtime
 ROOT = Path(__file__).resolve().parents[2]
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)
+FIRMWARE = """
+import sys
+from pathlib import Path
+from drivers.emulators.can_firmware import CanFirmware
+from drivers.emulators.command_log import CommandLog
+from drivers.emulators.vesc_firmware import VescFirmware
+
+with CanFirmware(VescFirmware(CommandLog(Path(sys.argv[2]))), channel=sys.argv[1]):
+    print("open", flush=True)
+    sys.stdin.buffer.read()
+"""
 CHILD = """
 import sys, time
 from carlab.core.quantities import Action
@@ -237,7 +248,7 @@ def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, vict
     channel = multicast_channel()
     log = tmp_path / "log.jsonl"
     firmware = subprocess.Popen(
-        [sys.executable, "-m", "drivers.emulators.can_firmware", "--channel", channel, "--log", str(log)],
+        [sys.executable, "-c", FIRMWARE, channel, str(log)],
         cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -246,7 +257,7 @@ def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, vict
     main = None
     try:
         assert firmware.stdout is not None
-        assert "id 23" in firmware.stdout.readline()
+        assert firmware.stdout.readline() == "open\n"
         main = subprocess.Popen(
             [sys.executable, "-c", CHILD, channel], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
