@@ -245,9 +245,7 @@ def test_curve_findings_of_the_car_file_equal_its_curve(curve):
     windows = cut_windows(segments_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     free = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ()).free_parameters((curve.id,))
     fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), np.eye(len(free)))
-    found = curve_findings(
-        CurveFit((curve.id,), (), fit, 5.0), CAR, tuple(segments_of([drive(CAR, 30.0, 7)])), DEFAULT.curves
-    )
+    found = curve_findings(CurveFit((curve.id,), fit), CAR, tuple(segments_of([drive(CAR, 30.0, 7)])), DEFAULT.curves)
     seen = np.isfinite(found[0].measured)
     assert seen.any()
     assert found[0].measured[seen] == pytest.approx(found[0].car_file[seen])
@@ -270,7 +268,7 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), covariance)
     segments = tuple(segments_of([drive(CAR, 60.0, 7)]))
     settings = replace(DEFAULT.curves, min_support_s=0.0)
-    found = curve_findings(CurveFit(("drive_map",), (), fit, 5.0), CAR, segments, settings)[0]
+    found = curve_findings(CurveFit(("drive_map",), fit), CAR, segments, settings)[0]
     assert found.std[12, 6] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
     assert found.std[12, 7] == pytest.approx(slope, rel=0.02)
     assert found.std[6, 7] == pytest.approx(0.0, abs=1e-9)  # no throttle

@@ -24,15 +24,11 @@ class CurveFit:
     """A fit with measured curves.
 
     curves            ids of the curves
-    effects           effects of the catalogue in the fit
     fit               the fit, with covariance
-    standard_errors   fall of the loss on left-out blocks, against the same model without curves, in standard errors
     """
 
     curves: tuple[str, ...]
-    effects: tuple[str, ...]
     fit: Fit
-    standard_errors: float
 
 
 def fit_curves(
@@ -66,7 +62,7 @@ def fit_curves(
     if gain < settings.accept_z_min * error:
         return None, (*rejected, RejectedCurves(curves, gain / error, settings.accept_z_min))
     fit = problem.fitter(scale).with_covariance(fit)
-    return CurveFit(curves, effects, fit, gain / error), rejected
+    return CurveFit(curves, fit), rejected
 
 
 def _effects_with(problem: SearchProblem, found: SearchResult, curves: tuple[str, ...]) -> tuple[str, ...]:

@@ -21,13 +21,11 @@ class LearnedPolicy:
     Attributes:
         policy: the policy.
         plan: plan of its run.
-        episode: number of the episode before which it was trained.
         history: number of past commands that it observes; a corrected prior may need more than the plan states.
     """
 
     policy: Policy
     plan: TrainingPlan
-    episode: int
     history: int
 
     @property
@@ -56,4 +54,4 @@ def load_policy(folder: Path) -> LearnedPolicy:
             f"The policy in {folders[-1]} has {agent.observation_size} features, its run at least "
             f"{feature_size(plan.history)}; remove the folder to train again."
         )
-    return LearnedPolicy(agent.policy(), plan, int(folders[-1].name), history)
+    return LearnedPolicy(agent.policy(), plan, history)
