@@ -8,15 +8,36 @@ from dataclasses import astuple
 from carlab.core.angles import wrap
 from carlab.core.car import Car
 from carlab.core.clock import Clock, SimulatedClock
-from carlab.core.errors import ActuatorFaultError, CarlabError, NotArmedError, NotOpenError, PoseLostError
+from carlab.core.errors import ActuatorFaultError, CarlabError, ConfigError, NotArmedError, NotOpenError, PoseLostError
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Health, Observation, PoseSample, Reality
 from carlab.core.state_estimator import StateEstimator
 from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.divergence import diverged, is_physical
 from sim_backends.measurement import MeasurementModel, State, filter_step
 from sim_backends.plant import Plant, Pose
 from sim_backends.sensor import MocapSensor
+
+MAX_SPEED_MPS = 100.0
+"""Speed beyond which a simulation has diverged; the fastest remote-controlled cars reach about 90 m/s."""
+MAX_YAW_RATE_RADPS = 200.0
+"""32 turns a second; spinning model cars reach about 30 rad/s."""
+
+
+def diverged(car: str) -> ConfigError:
+    """The error for a car whose simulation diverged."""
+    return ConfigError(
+        f"The simulation of car '{car}' diverged: its motion changes faster than the integration step resolves. Check "
+        "mass, yaw_inertia, damping and the tyres' B in the car file (SI units)."
+    )
+
+
+def is_physical(state: CarState) -> bool:
+    """Whether a state is finite and within the limits."""
+    return (
+        all(map(math.isfinite, astuple(state)))
+        and state.speed_mps <= MAX_SPEED_MPS
+        and abs(state.yaw_rate_radps) <= MAX_YAW_RATE_RADPS
+    )
 
 
 class _Approach:

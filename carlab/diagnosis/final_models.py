@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.ceiling import ceiling_of
 from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
 from carlab.diagnosis.curves.support import without_extrapolation
 from carlab.diagnosis.drift import Adaptation, adapt_to_held_out
@@ -149,6 +148,22 @@ def adapted(
     control.progress("adapting along the held-out recordings", 0.93)
     segments = recordings.fit_segments, recordings.held_out_segments
     return adapt_to_held_out(corrected.fit.config, *segments, corrected.held_out, request.settings.drift)
+
+
+def ceiling_of(refit_score: float, model_score: float, network_score: float) -> Ceiling | None:
+    """Shares of the refit's squared excess by held-out scores [noise floors]; None if the refit has no excess.
+
+    ``network_score`` is that of the better of black box and learned discrepancy.
+
+    The best of model and networks is the estimate of what can be explained. It is a lower bound: a larger network or
+    more recordings may predict more.
+    """
+    excess, model, network = (max(score**2 - 1.0, 0.0) for score in (refit_score, model_score, network_score))
+    if excess <= 0.0:
+        return None
+    model = min(model, excess)
+    best = min(model, network)
+    return Ceiling((excess - model) / excess, (model - best) / excess, best / excess)
 
 
 def ceiling_by_networks(errors: Mapping[str, FitErrors]) -> Ceiling | None:

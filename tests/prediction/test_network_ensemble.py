@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from carlab.core.errors import DataError
-from carlab.diagnosis.ceiling import ceiling_of
+from carlab.diagnosis.final_models import ceiling_of
 from carlab.prediction.errors import final_errors
 from carlab.prediction.network_ensemble import EnsembleSettings, train_ensemble
 from carlab.prediction.predict import ConstantVelocity, SimulatorModel

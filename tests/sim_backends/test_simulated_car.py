@@ -17,8 +17,7 @@ from carlab.core.errors import (
 )
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Reality
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
-from sim_backends.divergence import MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, is_physical
-from sim_backends.simulated_car import SimulatedCar
+from sim_backends.simulated_car import MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, SimulatedCar, is_physical
 
 QUIET = MocapParameters(position_std_m=0.0, yaw_std_rad=0.0)
 PERIOD_S = 1 / 30

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from carlab.core.angles import wrap
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
-from carlab.diagnosis.findings import EffectFinding, FigureData, Trace
+from carlab.diagnosis.findings import Drift, EffectFinding, FigureData, Trace
 from carlab.diagnosis.report.sentences import CHANNEL_NAMES, number, percent, unit_text
 from carlab.diagnosis.report.svg import Chart, bar_rows, padded
 
@@ -30,6 +30,13 @@ LABELS = {
     "noise_floor": "noise floor",
     "recorded": "recorded",
 }
+DRIFT_AXES = (
+    ("share of the drive force", "1"),
+    ("steering trim", "rad"),
+    ("share of the grip", "1"),
+    ("force", "m/s2"),
+)
+"""Name and unit of each estimated disturbance."""
 RESTART_FALL = 0.3
 """A restart lowers the position error below this share of that of the row before."""
 
@@ -233,3 +240,21 @@ def fingerprint_chart(effect: EffectFinding) -> Markup:
         for c, rise in ordered
     ]
     return bar_rows("Increase of each channel's error without the effect", rows, label_px=150, size=(430, 23))
+
+
+def drift_charts(drift: Drift) -> list[Figure]:
+    """Each disturbance over time with its 90 % band; none for a recording without an estimate."""
+    return [] if len(drift.t_s) < 2 else [_drift_chart(drift, k) for k in range(len(DRIFT_AXES))]
+
+
+def _drift_chart(drift: Drift, k: int) -> Figure:
+    name, unit = DRIFT_AXES[k]
+    mean, spread = drift.mean[:, k], 1.645 * drift.std[:, k]
+    label = name if unit == "1" else f"{name} [{unit_text(unit)}]"
+    span = padded(np.concatenate([mean - spread, mean + spread, [0.0]]))
+    chart = Chart(f"{name} over time", padded(drift.t_s), span, (300, 200), ("time [s]", label))
+    chart.across(0.0, "floor")
+    chart.line(drift.t_s, mean, "with_effects")
+    for sign in (-1.0, 1.0):
+        chart.line(drift.t_s, mean + sign * spread, "limit")
+    return Figure(chart.render(), "")

@@ -13,7 +13,6 @@ from carlab.diagnosis.report import figures
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve_sentences
 from carlab.diagnosis.report.drift import drift_sentences
-from carlab.diagnosis.report.drift_charts import drift_charts
 from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.diagnosis.report.residual import explained_share, relevant_residual, shown_errors
@@ -65,7 +64,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),
         "min_windows": DEFAULT.evidence.skill_windows_min,
-        "drift": [(d, drift_charts(d)) for d in diagnosis.drift],
+        "drift": [(d, figures.drift_charts(d)) for d in diagnosis.drift],
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),
         "rest": rest,
