@@ -228,12 +228,9 @@ def _diagnosed(
     options: Mapping[str, Any],
 ) -> DiagnosisReport:
     from carlab.diagnosis.diagnose import diagnose as search
-    from carlab.diagnosis.evidence import Texts
     from carlab.diagnosis.findings import Diagnosis, FigureData
     from carlab.diagnosis.recordings import Inconclusive
-    from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.report.write import completed
-    from sim_backends.effects import confusable_effects
 
     uses, faults = (*fit.uses, *validation.uses), (*fit.faults, *validation.faults)
     try:
@@ -242,7 +239,6 @@ def _diagnosed(
                 fit.episodes,
                 validation.episodes,
                 file.simulator,
-                Texts(effect_sentence, separating_drive, confusable_effects()),
                 uses=uses,
                 data_faults=faults,
                 seed=seed,

@@ -13,7 +13,6 @@ from carlab.diagnosis.curves.support import curve_findings
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import (
     ScoredSearch,
-    Texts,
     base_estimates,
     effect_findings,
     unexplained_share,
@@ -28,7 +27,7 @@ from carlab.diagnosis.final_models import (
     measured_curves,
     trained_models,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, final_model_name
+from carlab.diagnosis.findings import DataFault, Diagnosis, EffectFinding, FigureData, RecordingUse, final_model_name
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -43,6 +42,7 @@ from carlab.diagnosis.naming import (
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.figure_data import figure_data_of
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -56,7 +56,7 @@ from carlab.prediction.network_ensemble import EnsembleSettings, check_duration
 from carlab.prediction.predict import PredictiveModel
 from carlab.prediction.windows import PredictionWindows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CATALOGUE
+from sim_backends.effects import CATALOGUE, confusable_effects
 
 Progress = Callable[[str, float], None]
 SEARCH_PROGRESS = (0.05, 0.75)
@@ -78,7 +78,6 @@ def diagnose(
     fit: Sequence[EpisodeData],
     held_out: Sequence[EpisodeData],
     nominal: SimulatorConfig,
-    texts: Texts,
     *,
     uses: Sequence[RecordingUse] = (),
     data_faults: Sequence[DataFault] = (),
@@ -102,7 +101,6 @@ def diagnose(
         fit: recordings to fit.
         held_out: held-out recordings; if empty, the last part of each recording of ``fit`` is held out.
         nominal: the simulator of the car file.
-        texts: functions that phrase the report, and the confusable effects.
         uses: role of each recording, for the report.
         data_faults: faults that were found when the files were read; faults found here are added.
         effects: candidate effects, the whole catalogue by default. Requested ones are withdrawn by held-out error only.
@@ -127,7 +125,7 @@ def diagnose(
     timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)
     nominal = with_known_latency(nominal, (*fit, *held_out))
     stages = curves, ceiling, discrepancy, adapt, keep_events
-    request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
+    request = Request(nominal, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, workers or FunctionWorkers())
     recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
@@ -198,8 +196,7 @@ def _search_effects(
     identification = request.settings.identification
     floor: FloatArray = np.sqrt(np.mean(noise_floor(windows, noise, nominal, identification)[1:] ** 2, axis=0))
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
-    confusable = request.texts.confusable
-    problem = SearchProblem(nominal, windows, floor, noise.measured, confusable, candidates, request.settings)
+    problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
     start, search_share = SEARCH_PROGRESS
 
     def search_progress(activity: str, share: float) -> None:
@@ -226,14 +223,20 @@ def _search_effects(
     return scored, naming
 
 
+def _with_texts(finding: EffectFinding) -> EffectFinding:
+    """The finding with its sentence, and with the manoeuvre that separates it from its indistinguishable effects."""
+    others = finding.indistinguishable_from
+    sentence = effect_sentence(finding.id, finding.parameters, finding.car_file_values)
+    return replace(finding, sentence=sentence, separating_drive=separating_drive(finding.id, others) if others else "")
+
+
 def _assemble_result(
     scored: ScoredSearch, naming: NamingResult, recordings: SplitRecordings, request: Request, control: RunControl
 ) -> Outcome:
     """Compute evidence, unexplained residual, measured curves, ceiling, verdict and figure data."""
     held_out, progress = scored.held_out, control.progress
-    findings = effect_findings(
-        scored, request.texts, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share)
-    )
+    found = effect_findings(scored, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share))
+    findings = tuple(_with_texts(finding) for finding in found)
     share = unexplained_share(scored)
     unexplained, described = None, None
     if share >= request.settings.evidence.unexplained_share_min:

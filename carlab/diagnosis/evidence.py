@@ -25,20 +25,6 @@ from sim_backends.registry import REGISTRY
 
 
 @dataclass(frozen=True, slots=True)
-class Texts:
-    """Functions that return texts of the report.
-
-    effect             sentence of an effect with its numbers, and with those of the car file if it states the effect
-    separating_drive   manoeuvre that separates an effect from its confusable ones
-    confusable        confusable effects by effect id
-    """
-
-    effect: Callable[[str, Mapping[str, Estimate], Mapping[str, float]], str]
-    separating_drive: Callable[[str, Sequence[str]], str]
-    confusable: Mapping[str, Sequence[str]]
-
-
-@dataclass(frozen=True, slots=True)
 class ScoredSearch:
     """A search with the held-out errors of its models.
 
@@ -89,16 +75,16 @@ def _refined(problem: SearchProblem, found: SearchResult) -> tuple[SearchResult,
 
 
 def effect_findings(
-    scored: ScoredSearch, texts: Texts, progress: Callable[[float], None] = lambda share: None
+    scored: ScoredSearch, progress: Callable[[float], None] = lambda share: None
 ) -> tuple[EffectFinding, ...]:
-    """Each accepted effect with its evidence, the strongest first."""
+    """Each accepted effect with its evidence, the strongest first; without its sentence and drive."""
     if not scored.found.effects:
         return ()
     jacobian = scored.problem.fitter(scored.found.scale).linearised(scored.fit).jacobian
     found = []
     for k, name in enumerate(scored.found.effects):
         progress(k / len(scored.found.effects))
-        found.append(_finding(scored, name, texts, jacobian))
+        found.append(_finding(scored, name, jacobian))
     return tuple(found)
 
 
@@ -113,7 +99,7 @@ def scores_by_step(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
     return tuple(steps)
 
 
-def _finding(scored: ScoredSearch, name: str, texts: Texts, jacobian: FloatArray) -> EffectFinding:
+def _finding(scored: ScoredSearch, name: str, jacobian: FloatArray) -> EffectFinding:
     """An accepted effect; ``jacobian`` (n, S, U, 6) is that of the whitened errors at the fit."""
     found, held_out, full = scored.found, scored.held_out, scored.errors["with_effects"]
     others = tuple(e for e in found.effects if e != name)
@@ -137,9 +123,8 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts, jacobian: FloatArray
         parameters=parameters,
         where=_where(scored, name, parameters, error, without),
         evidence=evidence,
-        sentence=texts.effect(name, parameters, car_file_values),
+        sentence="",
         indistinguishable_from=others,
-        separating_drive=texts.separating_drive(name, others) if others else "",
         car_file_values=car_file_values,
     )
 

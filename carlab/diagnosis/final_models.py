@@ -9,7 +9,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
 from carlab.diagnosis.curves.support import without_extrapolation
 from carlab.diagnosis.drift import Adaptation, adapt_to_held_out
-from carlab.diagnosis.evidence import ScoredSearch, Texts, unexplained_share
+from carlab.diagnosis.evidence import ScoredSearch, unexplained_share
 from carlab.diagnosis.findings import Ceiling, CurveTrial, DataFault, FitErrors, RecordingUse, final_model_name
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
@@ -27,7 +27,6 @@ class Request:
     """Arguments of ``diagnose``."""
 
     nominal: SimulatorConfig
-    texts: Texts
     uses: Sequence[RecordingUse]
     data_faults: Sequence[DataFault]
     effects: Sequence[str] | None

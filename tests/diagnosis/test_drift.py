@@ -7,12 +7,10 @@ import pytest
 
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.drift import adapt_to_held_out
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.drift import drift_sentence
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
@@ -84,8 +82,7 @@ def test_drift_in_states_that_were_not_fitted_may_be_an_error_of_the_model(fitte
 
 def test_diagnosis_states_the_drift_in_its_report(fitted):
     held_out = changing_drive(CONFIG, SECONDS, 8, lambda t: 0.7, lambda t: 0.0)
-    texts = Texts(effect_sentence, separating_drive, {})
-    outcome = diagnose([fitted], [held_out], CONFIG, texts, effects=(), adapt=True)
+    outcome = diagnose([fitted], [held_out], CONFIG, effects=(), adapt=True)
     errors = outcome.diagnosis.held_out
     assert errors["adapted"].position_m < 0.4 * errors["refit"].position_m
     assert outcome.figure_data.noise.adaptation is not None
@@ -96,7 +93,7 @@ def test_diagnosis_states_the_drift_in_its_report(fitted):
     assert len(table["t_s"]) == len(table["mean"]) == len(table["std"])
     page = render_page(outcome.diagnosis, outcome.figure_data)
     assert "Change of the car since the fitted recordings" in page
-    without = diagnose([fitted], [held_out], CONFIG, texts, effects=())
+    without = diagnose([fitted], [held_out], CONFIG, effects=())
     assert without.diagnosis.drift == ()
     assert "adapted" not in without.diagnosis.held_out
     assert np.isclose(without.diagnosis.held_out["refit"].score, errors["refit"].score)

@@ -12,11 +12,9 @@ from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.selection.elimination import eliminate
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit
@@ -28,7 +26,6 @@ from carlab.recording.csv.foreign import import_csv
 from sim_backends.effects import EFFECTS, confusable_effects
 
 Table = dict[str, np.ndarray]
-TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 
 
 def episodes(path: Path, table: Table) -> list[EpisodeData]:
@@ -45,7 +42,7 @@ def write(folder: Path, case: Case) -> Path:
 
 def outcome(folder: Path, change: Callable[[Table], Table] = dict, effects: tuple[str, ...] | None = None) -> Outcome:
     fit, hold = (episodes(folder / f"_{name}", change(read_csv(folder / name))) for name in ("fit.csv", "hold.csv"))
-    return diagnose(fit, hold, load_car_file(folder / "car.toml").simulator, TEXTS, effects=effects)
+    return diagnose(fit, hold, load_car_file(folder / "car.toml").simulator, effects=effects)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +99,7 @@ def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -
     ranges = []
     for rows in (slice(None, middle), slice(middle, None)):
         half = {name: column[rows] for name, column in table.items()}
-        found = diagnose(episodes(tmp_path / "half.csv", half), hold, car, TEXTS, effects=CANDIDATES).diagnosis
+        found = diagnose(episodes(tmp_path / "half.csv", half), hold, car, effects=CANDIDATES).diagnosis
         assert [e.id for e in found.effects] == ["aerodynamic_drag"]
         ranges.append(found.effects[0].parameters["coefficient"])
     first, second = ranges

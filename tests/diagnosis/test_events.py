@@ -14,14 +14,11 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.events import Event, EventUse, find_events, grip_limits, mark_events
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.report.events import diagnosed_event_sentences, event_sentences
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.score_recording import MODEL, score_recording
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends.car_parameters import CarParameters, SimulatorConfig
-from sim_backends.effects import confusable_effects
 from tests.helpers.event_drives import EventDrive, event_drive
 
 STUDY_DRIVES = 100
@@ -154,8 +151,7 @@ def hit() -> EventDrive:
 
 @pytest.fixture(scope="module")
 def outcome(hit: EventDrive) -> Outcome:
-    texts = Texts(effect_sentence, separating_drive, confusable_effects())
-    return diagnose([hit.episode], [], hit.config, texts, effects=("steering_lag",))
+    return diagnose([hit.episode], [], hit.config, effects=("steering_lag",))
 
 
 def test_diagnosis_lists_events_and_scores_without_and_with_them(hit: EventDrive, outcome: Outcome) -> None:

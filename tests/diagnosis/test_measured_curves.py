@@ -13,12 +13,11 @@ from carlab.diagnosis.curves.curve_fit import fit_curves
 from carlab.diagnosis.curves.simulator_with_curves import simulator_with_curves
 from carlab.diagnosis.curves.support import curve_findings, driving_time_s
 from carlab.diagnosis.diagnose import diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import CurveAxis, CurveFinding, CurveTrial, FigureData, RejectedCurves
 from carlab.diagnosis.identification.fit import Fitter, Scale
 from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, with_unit
+from carlab.diagnosis.report.sentences import with_unit
 from carlab.diagnosis.report.write import write_report
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -27,7 +26,7 @@ from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
-from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter, confusable_effects
+from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter
 from tests.diagnosis.report_material import no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -79,9 +78,8 @@ def drives():
 @pytest.fixture(scope="module")
 def outcome(drives):
     fit, held_out = drives
-    texts = Texts(effect_sentence, separating_drive, confusable_effects())
     with only_curve("drive_map"):
-        return diagnose([fit], [held_out], CAR, texts, effects=("steering_lag",), settings=SETTINGS, curves=True)
+        return diagnose([fit], [held_out], CAR, effects=("steering_lag",), settings=SETTINGS, curves=True)
 
 
 def test_measured_curves_lower_the_held_out_error(outcome):

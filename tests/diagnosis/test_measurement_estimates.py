@@ -17,20 +17,16 @@ from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import drive as simulated_drive
 from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import confusable_effects
 
-TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 SEEDS = (61, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (62, 63)))
 
 
@@ -163,7 +159,7 @@ def test_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, fixed_freque
 )
 def test_vibration_is_described_without_an_effect(shaking: Drive, effects: tuple[str, ...] | None) -> None:
     fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
-    found = diagnose(fit, hold, shaking.nominal, TEXTS, effects=effects).diagnosis
+    found = diagnose(fit, hold, shaking.nominal, effects=effects).diagnosis
     assert found.verdict == "unexplained"
     assert found.unexplained is not None
     assert found.unexplained.kind.startswith("vibration")

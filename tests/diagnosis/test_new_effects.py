@@ -18,10 +18,8 @@ from carlab.core.errors import ConfigError
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.core.quantities import Action, CarState
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.report.sentences import (
     effect_noun,
-    effect_sentence,
     refutation_sentence,
     separating_drive,
     separating_reason,
@@ -138,8 +136,7 @@ def recording(seed: int, seconds: float = 16.0) -> EpisodeData:
 @pytest.fixture(scope="module")
 def found(_registered: None) -> Outcome:
     """Diagnose the nominal car with the three candidate effects."""
-    texts = Texts(effect_sentence, separating_drive, confusable_effects())
-    return diagnose([recording(1)], [recording(2, 8.0)], SimulatorConfig(), texts, effects=IDS)
+    return diagnose([recording(1)], [recording(2, 8.0)], SimulatorConfig(), effects=IDS)
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,8 @@ from carlab.core.clock import SimulatedClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import SearchExtent
 from carlab.diagnosis.identification.fit import Scale
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection import refit as refit_module
@@ -31,11 +29,10 @@ from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends import SimulatorConfig
-from sim_backends.effects import CATALOGUE, confusable_effects
+from sim_backends.effects import CATALOGUE
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 Table = dict[str, np.ndarray]
-TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
 """A quarter of the windows of the default. They do not overlap."""
 HALF = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
@@ -96,7 +93,7 @@ def found(
         write_csv(folder / "drive.csv", turned(table, angle))
         read.append(list(import_csv(folder / "drive.csv").episodes))
     case.nominal.write(folder / "car.toml")
-    return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS, settings=settings, **options)
+    return diagnose(*read, load_car_file(folder / "car.toml").simulator, settings=settings, **options)
 
 
 def names(outcome: Outcome) -> list[str]:

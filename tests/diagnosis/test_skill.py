@@ -7,15 +7,13 @@ import pytest
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import diagnose
-from carlab.diagnosis.evidence import Texts
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, worse_than_constant_velocity
+from carlab.diagnosis.report.sentences import worse_than_constant_velocity
 from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.skill import skill_of
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import ConstantVelocity, NoChange
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
-from sim_backends.effects import confusable_effects
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 RADIUS_M, YAW_RATE = 1.5, 0.8
@@ -56,8 +54,7 @@ def test_the_floor_depends_on_recording_and_car_file_alone() -> None:
     car = SimulatorConfig(control_period_s=PERIOD_S)
     weak = car.with_values({"motor.drive_gain": 0.8 * car.values()["motor.drive_gain"]})
     episode = drive(weak, 40.0, 5)
-    texts = Texts(effect_sentence, separating_drive, confusable_effects())
-    found = [diagnose([episode], [], car, texts, effects=names) for names in ([], ["motor_lag", "steering_offset"])]
+    found = [diagnose([episode], [], car, effects=names) for names in ([], ["motor_lag", "steering_offset"])]
     first, second = (each.diagnosis.held_out for each in found)
     for name in ("noise_floor", "nominal", "refit", "constant_velocity"):
         assert first[name] == second[name]

@@ -7,16 +7,13 @@ import pytest
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.recordings import Inconclusive, split_recordings
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
-TEXTS = Texts(effect_sentence, separating_drive, {})
 
 
 def parked_from(episode: EpisodeData, begin_s: float) -> EpisodeData:
@@ -43,5 +40,5 @@ def test_short_recording_at_a_high_rate_is_not_called_faulty() -> None:
     fast = EpisodeData(times_s, states, commands, commands, np.zeros(700))
     fault = DataFault("outliers", "x, y, yaw", 1, "repaired: one row.")
     with pytest.raises(Inconclusive, match=r"contain 7\.0 s of driving") as caught:
-        diagnose([fast], [], CAR, TEXTS, data_faults=[fault])
+        diagnose([fast], [], CAR, data_faults=[fault])
     assert caught.value.verdict == "inconclusive"

@@ -10,11 +10,10 @@ from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, Estimate, Evidence
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, verdict_sentence
+from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
 from carlab.diagnosis.report.write import completed, with_parameter_std
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.screening import Screen
@@ -22,10 +21,9 @@ from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CATALOGUE, CURVES, EFFECTS, confusable_effects
+from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
 
 Table = dict[str, np.ndarray]
-TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
 """A quarter of the windows of the default."""
 MISALIGNMENT = "mocap_yaw_misalignment"
@@ -71,7 +69,7 @@ def diagnosed(case: Case, folder: Path, nominal: SimulatorConfig, angle_rad: flo
         write_csv(folder / "drive.csv", rotated(table, angle_rad))
         read.append(list(import_csv(folder / "drive.csv").episodes))
     stated = replace(nominal, effects={MISALIGNMENT: {"angle": stated_rad}})
-    return diagnose(*read, stated, TEXTS, settings=FEWER)
+    return diagnose(*read, stated, settings=FEWER)
 
 
 def test_wrong_number_of_a_stated_effect_is_named(case: Case, tmp_path: Path, nominal: SimulatorConfig) -> None:
@@ -226,7 +224,7 @@ def test_requested_effect_that_increases_the_held_out_error_is_withdrawn(
     for table, angle_rad in ((case.fit, 0.06), (case.hold, -0.06 if is_opposite else 0.06)):
         write_csv(tmp_path / "drive.csv", rotated(table, angle_rad))
         read.append(list(import_csv(tmp_path / "drive.csv").episodes))
-    outcome = diagnose(*read, known, TEXTS, settings=FEWER, effects=(MISALIGNMENT,))
+    outcome = diagnose(*read, known, settings=FEWER, effects=(MISALIGNMENT,))
     assert [effect.id for effect in outcome.diagnosis.effects] == ([] if is_opposite else [MISALIGNMENT])
 
 

@@ -13,15 +13,12 @@ from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.evidence import Texts
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.settings import DEFAULT
 from carlab.recording.csv.foreign import import_csv
 from sim_backends import EFFECTS, SimulatorConfig
 from sim_backends.array_ops import ARRAYS
-from sim_backends.effects import CATALOGUE, MeasuredCurve, confusable_effects
+from sim_backends.effects import CATALOGUE, MeasuredCurve
 
-TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
 """Half as many windows as by default. They overlap less, so they have nearly as much information."""
 STATIC = ("steering_deadband", "steering_asymmetry", "steering_nonlinearity", "steering_offset", "yaw_damping")
@@ -39,7 +36,7 @@ def found(case: Case, folder: Path, candidates: tuple[str, ...], monkeypatch: py
     write_csv(folder / "hold.csv", case.hold)
     case.nominal.write(folder / "car.toml")
     read = [list(import_csv(folder / name).episodes) for name in ("fit.csv", "hold.csv")]
-    return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS, settings=FEWER)
+    return diagnose(*read, load_car_file(folder / "car.toml").simulator, settings=FEWER)
 
 
 def decisions_by(outcome: Outcome, setting: str) -> list[Decision]:

@@ -30,7 +30,6 @@ from carlab.recording.atomic_files import write_json
 from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import confusable_effects
 from sim_backends.registry import REGISTRY
 
 if TYPE_CHECKING:
@@ -147,17 +146,14 @@ def contradicted_by(
 def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorConfig, budget_s: float) -> Findings:
     """The findings with a diagnosis of all episodes, of which every third is held out."""
     from carlab.diagnosis.diagnose import diagnose
-    from carlab.diagnosis.evidence import Texts
     from carlab.diagnosis.recordings import Inconclusive
-    from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.state_alignment import align_states
 
     aligned = [align_states(e, car.latency_s()) for e in episodes]
     held_out = aligned[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
     fit = [e for k, e in enumerate(aligned) if k % HELD_OUT_EVERY != HELD_OUT_EVERY - 1]
-    texts = Texts(effect_sentence, separating_drive, confusable_effects())
     try:
-        outcome = diagnose(fit, held_out, car, texts, budget_s=budget_s)
+        outcome = diagnose(fit, held_out, car, budget_s=budget_s)
     except Inconclusive as error:
         return replace(found, diagnosis=error.verdict)
     verdict, is_complete = outcome.diagnosis.verdict, outcome.diagnosis.search.is_complete
