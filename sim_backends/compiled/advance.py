@@ -1,7 +1,7 @@
-"""Compiled advance of cars: actuators, dynamics and the filter of measured velocities in one function.
+"""Compiled advance of cars: actuators and dynamics in one function.
 
-The equations (``ActuatorChain.step``, ``rk4_step``, ``filter_step``) are traced once for each kind of model and set of
-effects, and compiled to machine code: loops over segments and integration steps, and the derivative of one step.
+The equations (``ActuatorChain.step``, ``rk4_step``) are traced once for each kind of model and set of effects, and
+compiled to machine code: loops over segments and integration steps, and the derivative of one step.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from sim_backends.dynamics.integrate import integrate_held
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.effects import EFFECTS, DelayEffect, Effect
 from sim_backends.effects.base import ModelKind
-from sim_backends.measurement import MeasurementModel, filter_step
 from sim_backends.registry import REGISTRY
 
 BODY_ROWS = 6
@@ -43,16 +42,14 @@ class Key(NamedTuple):
 
     kind: ModelKind
     effects: tuple[Effect, ...]
-    has_filter: bool = False
-    """Whether measured velocities are filtered."""
     has_body: bool = True
     """Whether the dynamics are simulated, and not the actuators alone."""
 
     @classmethod
-    def of(cls, kind: ModelKind, effects: Iterable[str], has_filter: bool = False) -> Key:
+    def of(cls, kind: ModelKind, effects: Iterable[str]) -> Key:
         """The key of effects (ids), which act in an order of their own; delays are no part of a step."""
         chosen = [e for e in map(EFFECTS.__getitem__, sorted(effects)) if not isinstance(e, DelayEffect)]
-        return cls(kind, tuple(chosen), has_filter)
+        return cls(kind, tuple(chosen))
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +80,7 @@ class Graph:
 
 @functools.lru_cache(maxsize=256)
 def trace_step(key: Key) -> Graph:
-    """Trace one step: carried are the states of the body and of the actuators, and the filtered velocities if any."""
+    """Trace one step: carried are the states of the body and of the actuators."""
     tracer = Tracer()
     ops = cast(Ops, tracer)
     ids = [effect.id for effect in key.effects]
@@ -93,20 +90,15 @@ def trace_step(key: Key) -> Graph:
     model, chain = SingleTrack(ops, key.kind, values, ids), ActuatorChain(ops, values, ids)
     state = tuple(tracer.input(f"state{i}") for i in range(6 + len(model.extra_states) if key.has_body else 0))
     memory = tuple(tracer.input(f"memory{i}") for i in range(len(chain.settled((steering, throttle)))))
-    filtered = tuple(tracer.input(f"filtered{i}") for i in range(3 if key.has_filter else 0))
     if key.has_body:
         after, memory_after = integrate_held(model, chain, t_s, state, memory, (steering, throttle), step_s, 1)
     else:
         after, memory_after = (), chain.step((steering, throttle), memory, step_s)[1]
     outputs = [*after, *memory_after]
-    if key.has_filter:
-        measurement = MeasurementModel(ops, values, ids)
-        first, last = (measurement.observe(s[:6])[3:6] for s in (state, after))
-        outputs += filter_step(ops, filtered, first, last, step_s, measurement.velocity_time_constant_s)
     used = {node.index for node in needed_nodes(outputs)}
     parameters = {name: node for name, node in values.items() if node.index in used}
     commands, uses_time = (steering, throttle), t_s.index in used
-    return Graph(tracer, parameters, step_s, commands, t_s, uses_time, [*state, *memory, *filtered], outputs)
+    return Graph(tracer, parameters, step_s, commands, t_s, uses_time, [*state, *memory], outputs)
 
 
 @functools.lru_cache(maxsize=256)
