@@ -5,17 +5,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
 
-from carlab.experiment.campaign.child_process import child_context, interrupts_blocked
+from carlab.experiment.campaign.child_process import child_context, interrupts_blocked, run_in_child
 
 CHILD = """
 import signal
@@ -110,3 +114,20 @@ def test_stop_does_not_wait_for_the_imports_of_the_server(tmp_path: Path) -> Non
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=50.0
     )
     assert (ended.returncode, ended.stdout) == (0, "None\n2.0\n"), ended.stderr
+
+
+def test_server_that_is_killed_by_a_stop_has_ended_when_the_stop_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next child could not connect to a server that is ending."""
+    child_context()
+    server, kill = forkserver._forkserver._forkserver_pid, os.kill  # type: ignore[attr-defined]
+
+    def kill_later(pid: int, number: int) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            time.sleep(0.3)
+            kill(pid, number)
+
+    monkeypatch.setattr(os, "kill", lambda *given: threading.Thread(target=kill_later, args=given).start())
+    assert run_in_child("root", math.sqrt, (4.0,), lambda: True) is None
+    state = Path(f"/proc/{server}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    assert state == "Z", "multiprocessing has to see its end"
+    assert run_in_child("root", math.sqrt, (4.0,), lambda: False) == 2.0

@@ -6,14 +6,13 @@ import functools
 import os
 import queue
 import socket
-import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from learning_runs import TICKS, drive
+from learning_runs import TICKS, drive, hang
 
 import carlab
 from carlab.core.documents import EpisodeStarted, Tick
@@ -24,18 +23,11 @@ from carlab.experiment.campaign.live_view import Activity, LiveSettings, LiveVie
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.rerun.viewer import check_viewer
 from tests.helpers.rerun_files import cells, tabs
+from tests.helpers.waiting import until
 
 
 def save_to(stream: Any, path: Path) -> None:
     stream.save(path)
-
-
-def write_priority(stream: Any, path: Path) -> None:
-    path.write_text(f"{os.getsid(0)} {os.getpriority(os.PRIO_PROCESS, 0)}")
-
-
-def hang(stream: Any) -> None:
-    threading.Event().wait()
 
 
 def test_view_shows_all_episodes_that_were_emitted(tmp_path: Path) -> None:
@@ -68,12 +60,11 @@ def test_hanging_viewer_loses_documents_and_does_not_block(tmp_path: Path, monke
 def test_view_has_a_low_priority_and_its_own_session(tmp_path: Path) -> None:
     """A session that mixes priorities can keep the sender from the processors."""
     before = os.getpriority(os.PRIO_PROCESS, 0)
-    with LiveView(LiveSettings(tmp_path, 1, False, functools.partial(write_priority, path=tmp_path / "priority"))):
-        pass
+    with LiveView(LiveSettings(tmp_path, 1, False, hang)) as view:
+        pid = view._process.pid
+        until(lambda: os.getpriority(os.PRIO_PROCESS, pid) == min(before + live_view.NICENESS, 19))
+        assert os.getsid(pid) == pid
     assert os.getpriority(os.PRIO_PROCESS, 0) == before
-    session, niceness = map(int, (tmp_path / "priority").read_text().split())
-    assert session != os.getsid(0)
-    assert niceness == min(before + live_view.NICENESS, 19)
 
 
 def test_invalid_viewers_are_refused_before_the_car_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

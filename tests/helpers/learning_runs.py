@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -90,3 +91,8 @@ def log_sent_actions(choice: CarChoice) -> list[Action]:
 def small_plan(**changes: Any) -> TrainingPlan:
     """A plan whose training takes a second."""
     return tiny_plan(choose_car("sim"), model_steps=20, updates=8, **changes)
+
+
+def hang(stream: object) -> None:
+    """A viewer that does not answer; here, because the process of a live view imports it."""
+    threading.Event().wait()

@@ -98,7 +98,9 @@ def _start(child: ForkServerProcess, stop: Callable[[], bool]) -> bool:
     while thread.is_alive() and not (stopped := stop()):
         thread.join(POLL_S)
     if stopped:
-        os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)  # type: ignore[attr-defined]
+        server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+        os.kill(server, signal.SIGKILL)
+        os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT)  # multiprocessing takes a dying server for a running one
         thread.join()
     elif errors:
         raise errors[0]
