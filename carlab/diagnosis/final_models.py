@@ -152,7 +152,7 @@ def adapted(
 def ceiling_of(refit_score: float, model_score: float, network_score: float) -> Ceiling | None:
     """Shares of the refit's squared excess by held-out scores [noise floors]; None if the refit has no excess.
 
-    ``network_score`` is that of the better of black box and learned discrepancy.
+    ``network_score`` is the lower score of black box and learned discrepancy.
 
     The best of model and networks is the estimate of what can be explained. It is a lower bound: a larger network or
     more recordings may predict more.

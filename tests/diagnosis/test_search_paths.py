@@ -28,7 +28,7 @@ def problem() -> SearchProblem:
 
 @pytest.fixture
 def followed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """First effects of the paths that are followed; each path ends after it, and none is better."""
+    """First effects of the followed paths. Each path ends after that effect, and none replaces the greedy one."""
     effects: list[str] = []
 
     def add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], control: RunControl) -> Path:

@@ -131,3 +131,15 @@ def test_server_that_is_killed_by_a_stop_has_ended_when_the_stop_returns(monkeyp
     state = Path(f"/proc/{server}/stat").read_text().rsplit(")", 1)[1].split()[0]
     assert state == "Z", "multiprocessing has to see its end"
     assert run_in_child("root", math.sqrt, (4.0,), lambda: False) == 2.0
+
+
+def test_stop_returns_if_the_other_thread_has_seen_the_end_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that starts the child replaces an ended server, after which the system no longer knows it."""
+    waitid = os.waitid
+
+    def after_the_other_thread(kind: int, pid: int, options: int) -> None:
+        waitid(kind, pid, options)
+        raise ChildProcessError
+
+    monkeypatch.setattr(os, "waitid", after_the_other_thread)
+    assert run_in_child("root", math.sqrt, (4.0,), lambda: True) is None

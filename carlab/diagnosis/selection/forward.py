@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.selection.candidates import accepted, next_candidates
 from carlab.diagnosis.selection.moves import apply_moves
@@ -25,8 +24,6 @@ log = logging.getLogger(__name__)
 
 ALTERNATIVES_PROGRESS = 0.9
 """Progress of the search while other choices are followed."""
-SAME_LOSS = 1e-3
-"""Share of the loss by which equal losses (S,) may differ: fits end at a finite distance from their minimum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +57,7 @@ def extend(
 ) -> Path:
     """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets."""
     max_effects = problem.settings.selection.max_effects
-    while len(path.model.effects) < max_effects and _set(path) not in visited and not control.ends_search():
+    while len(path.model.effects) < max_effects and _effects(path) not in visited and not control.ends_search():
         count = len(path.model.effects)
         control.progress(f"searching for effect {count + 1}", count / max_effects)
         candidates = next_candidates(problem, path.model, control)
@@ -68,15 +65,15 @@ def extend(
         chosen = accepted(problem, path.model, candidates, control)
         if not chosen or control.ends_search():
             break
-        before = _set(path)
+        before = _effects(path)
         path = _add(problem, path, chosen, control)
-        if _set(path) == before:
+        if _effects(path) == before:
             break
     return path
 
 
 def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunControl) -> Path:
-    """The greedy path, or the path with one other choice that predicts left-out blocks significantly better.
+    """The greedy path, or a path with one other choice whose loss on left-out blocks is significantly lower.
 
     A path ends where it has the effects that an earlier path had after a step, because it would continue as that path.
     """
@@ -85,7 +82,7 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
         return greedy
     best, visited = greedy, set(greedy.visited)
     best_first = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.left_out_gain)
-    choices = _distinct(best_first[: settings.max_alternatives])
+    choices = _distinct(best_first[: settings.max_alternatives], settings.same_loss_share)
     for k, choice in enumerate(choices):
         if remaining_excess(problem, base, best.model) < settings.min_remaining_excess or control.ends_search():
             break
@@ -93,7 +90,7 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
         log.info("alternative %d of %d: %s", k + 1, len(choices), ", ".join(names))
         labelled = _labelled(control, f"alternative {k + 1} of {len(choices)}")
         path = extend(problem, _add(problem, choice.path, (choice.candidate,), labelled), labelled, visited)
-        is_new = _set(path) not in visited
+        is_new = _effects(path) not in visited
         visited |= path.visited
         if not is_new:
             log.info("it continues as an earlier path: %s", ", ".join(path.model.effects))
@@ -104,21 +101,18 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
     return best
 
 
-def _distinct(choices: Sequence[Choice]) -> list[Choice]:
-    """Choices without those that predict each left-out window as an earlier choice of the same path does.
+def _distinct(choices: Sequence[Choice], same_loss_share: float) -> list[Choice]:
+    """The choices, except those with the same loss in each left-out window as an earlier choice of the same path.
 
-    Examples are a delay of both commands and a latency of motion capture.
+    A delay of both commands and a latency of motion capture, for example, predict the same measurements.
     """
     found: list[Choice] = []
     for choice in choices:
-        losses = (c.candidate.left_out_loss for c in found if c.path is choice.path)
-        if not any(_is_same(choice.candidate.left_out_loss, loss) for loss in losses):
+        loss = choice.candidate.left_out_loss
+        others = (c.candidate.left_out_loss for c in found if c.path is choice.path)
+        if not any(np.abs(loss - other).sum() <= same_loss_share * other.sum() for other in others):
             found.append(choice)
     return found
-
-
-def _is_same(loss: FloatArray, other: FloatArray) -> bool:
-    return bool(np.abs(loss - other).sum() <= SAME_LOSS * other.sum())
 
 
 def remaining_excess(problem: SearchProblem, base: Model, model: Model) -> float:
@@ -144,7 +138,7 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     )
 
 
-def _set(path: Path) -> frozenset[str]:
+def _effects(path: Path) -> frozenset[str]:
     return frozenset(path.model.effects)
 
 

@@ -38,7 +38,7 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
 
 
 def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], control: RunControl) -> Model | None:
-    """Replace an effect of the model by a confusable effect that fits significantly better.
+    """Replace an effect of the model by a confusable effect with which the loss is significantly lower.
 
     Args:
         problem: the search problem.

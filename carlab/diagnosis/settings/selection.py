@@ -80,6 +80,9 @@ class SelectionSettings:
     cost time and seldom change a name."""
     max_alternatives: int = 3
     """Maximum number of other choices that are followed to their end."""
+    same_loss_share: float = 1e-3
+    """Two choices are equal if their losses differ by at most this share, summed over left-out windows: fits end at a
+    finite distance from their minimum."""
     scale_change_max: float = 0.03
     """Relative change of the error scale at convergence."""
     scale_iterations: int = 4

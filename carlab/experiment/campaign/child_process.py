@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -9,7 +10,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, ForkServerProcess
@@ -54,7 +54,7 @@ def child_context() -> ForkServerContext:
     return context
 
 
-@contextmanager
+@contextlib.contextmanager
 def interrupts_blocked() -> Iterator[None]:
     """Block SIGINT in processes that are started in this block; here it arrives after the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -64,7 +64,7 @@ def interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _without_main_that_is_no_file() -> Iterator[None]:
     """Hide the name of a script from standard input (``<stdin>``), which a new process would try to execute."""
     main = vars(sys.modules["__main__"])
@@ -100,7 +100,8 @@ def _start(child: ForkServerProcess, stop: Callable[[], bool]) -> bool:
     if stopped:
         server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
         os.kill(server, signal.SIGKILL)
-        os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT)  # multiprocessing takes a dying server for a running one
+        with contextlib.suppress(ChildProcessError):  # the other thread has seen its end
+            os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT)  # the next child would connect to a server that ends
         thread.join()
     elif errors:
         raise errors[0]
