@@ -126,16 +126,13 @@ class NumpyOps:
 
     @staticmethod
     def fma(a: Value, b: Value, c: Value) -> Value:
-        """``a * b + c`` with one temporary."""
-        product = a * b
-        product += c
-        return product
+        """``a * b + c``."""
+        return a * b + c
 
     @staticmethod
     def fms(a: Value, b: Value, c: Value) -> Value:
-        """``c - a * b`` with one temporary."""
-        product = a * b
-        return np.subtract(c, product, out=product) if isinstance(product, np.ndarray) else c - product
+        """``c - a * b``."""
+        return c - a * b
 
 
 FLOATS: Ops = FloatOps()

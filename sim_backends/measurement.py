@@ -96,9 +96,21 @@ class MeasurementModel:
                 from_poses = effect.observe(self._ops, from_poses, values)
         return from_poses
 
+    def ticks_in_use(self, ticks: Iterable[int] | None, last: int, window_s2: float) -> list[int]:
+        """Ascending ticks of the true states on which ``measure`` depends, of those from 0 to ``last``.
+
+        ``ticks`` and ``window_s2`` are those of ``measure``.
+        """
+        if ticks is None or self.velocity_time_constant_s is not None:
+            return list(range(last + 1))
+        if window_s2 <= 0.0 or last < 2:
+            return sorted({int(k) for k in ticks})
+        inner = ((int(k), min(max(int(k), 1), last - 1)) for k in ticks)
+        return sorted({tick for k, m in inner for tick in (k, m - 1, m, m + 1)})
+
     def measure(
         self,
-        trajectory: Sequence[State],
+        trajectory: Sequence[State] | Mapping[int, State],
         period_s: Value,
         *,
         window_s2: float = 0.0,
@@ -109,7 +121,7 @@ class MeasurementModel:
         """Measured states of a trajectory at even ticks, in the recording's own time (latency is not applied).
 
         Args:
-            trajectory: True states, one for each tick.
+            trajectory: True states by tick, at least those of ``ticks_in_use``.
             period_s: From one tick to the next [s].
             window_s2: Variance [s2] of the window over which velocities were differentiated; not used for fewer than
                 three ticks.
@@ -118,10 +130,9 @@ class MeasurementModel:
             filtered: Output of the filter at the first tick; by default the filter starts settled.
             ticks: Indices of the ticks to return; all by default.
         """
-        wanted = range(len(trajectory)) if ticks is None else ticks
+        last = (max(trajectory) if isinstance(trajectory, Mapping) else len(trajectory) - 1) if trajectory else -1
+        wanted = range(last + 1) if ticks is None else ticks
         observed = functools.cache(lambda k: self.observe(trajectory[k]))
-
-        last = len(trajectory) - 1
 
         def shown(k: int) -> State:
             if window_s2 <= 0.0 or last < 2:
@@ -132,7 +143,7 @@ class MeasurementModel:
 
         if self.velocity_time_constant_s is None:
             return [shown(k) for k in wanted]
-        every = [shown(k) for k in range(len(trajectory))]
+        every = [shown(k) for k in range(last + 1)]
         inputs = [*velocities_before, *(state[3:6] for state in every)]
         outputs = filter_velocities(self._ops, inputs, period_s, self.velocity_time_constant_s, filtered)
         return [(*every[k][:3], *outputs[len(velocities_before) + k]) for k in wanted]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -126,53 +125,54 @@ def simulate_windows(
     Returns:
         Predicted measurements (P, S, K + 1 or U, 6) in the order and units of ``PredictiveModel``.
     """
-    whole, shaped = _by_set(config, values or {})
-    sets, count = len(shaped["vehicle.mass"]), len(windows)
-    measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
+    whole, numbers, sets = _by_set(config, values or {})
+    measurement = MeasurementModel(ARRAYS, numbers, whole.effects)
     effects = [name for name in whole.effects if EFFECTS[name].kind != "observation"]
-    numbers = {name: value for name, value in shaped.items() if not is_measurement_parameter(name)}
-    numbers[COMMAND_DELAY] = np.asarray(delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s))
     invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
-    start = _stacked([invert(tuple(windows.initial_states.T))], sets)[0]
-    origin = _origins(start, effects)
+    start = _stacked([invert(tuple(windows.initial_states.T))])[0]
+    past = _past_of_hidden_states(windows, measurement, effects)
+    origin = _origins(start, whole.effects)
     is_far = bool((np.abs(start - origin)[:3] > MAX_SINGLE_POSE).any())
     dtype = np.float64 if in_double or is_far else np.float32
     parts, commands = windows.part_commands(dtype)
-    numbers["timing.control_period"] = np.full((sets, 1), windows.period_s / parts)
-    past = _past_of_hidden_states(windows, measurement, effects)
-    simulate = partial(
-        array_rollout if engine == "fastest" else operator_rollout,
+    used = measurement.ticks_in_use(ticks, windows.steps, windows.velocity_window_s2)
+    simulate = array_rollout if engine == "fastest" else operator_rollout
+    states = simulate(
         whole.kind,
         effects,
-        commands=commands,
-        ticks=windows.steps * parts,
+        _true_car(numbers, effects, measurement) | {"timing.control_period": windows.period_s / parts},
+        (start - origin).astype(dtype),
+        commands,
+        windows.steps * parts,
         before=windows.past_commands.shape[1] * parts,
+        past_states=None if past is None else (past - origin).astype(dtype),
         t0_s=windows.t0_s.astype(dtype),
-        max_step_s=step_for(windows, whole.kind, shaped, whole.effects) if max_step_s is None else max_step_s,
+        max_step_s=step_for(windows, whole.kind, numbers, whole.effects) if max_step_s is None else max_step_s,
         every=parts,
+        returned=np.array(used),
     )
-    states = np.empty((windows.steps + 1, 6, sets, count))
-    for k in range(sets):
-        own = {name: _of_set(value, k, dtype) for name, value in numbers.items()}
-        at_start = (start[:, k] - origin[:, k]).astype(dtype)
-        past_states = None if past is None else (past[:, :, k % past.shape[2]] - origin[:, k]).astype(dtype)
-        states[:, :, k] = simulate(own, at_start, past_states=past_states)
-    states += origin
-    trajectory: list[State] = [tuple(tick) for tick in states]
-    return _stacked(_measured(trajectory, windows, measurement, ticks), sets).transpose(2, 3, 0, 1)
+    in_type = {name: v.astype(dtype) if isinstance(v, np.ndarray) else v for name, v in numbers.items()}
+    trajectory = {tick: tuple(own) for tick, own in zip(used, states, strict=True)}
+    measured = _measured(trajectory, windows, MeasurementModel(ARRAYS, in_type, whole.effects), ticks)
+    predicted = _stacked(measured, sets)
+    predicted[:, :3] += origin[:3]
+    return predicted.transpose(2, 3, 0, 1)
+
+
+def _true_car(
+    numbers: Mapping[str, float | FloatArray], effects: Sequence[str], measurement: MeasurementModel
+) -> dict[str, Any]:
+    """Numbers of the car without its measurement; commands act later by the latency of the measurement."""
+    own = {name: value for name, value in numbers.items() if not is_measurement_parameter(name)}
+    return own | {COMMAND_DELAY: delay_as_recorded_s(ARRAYS, numbers, effects, measurement.latency_s)}
 
 
 def longest_step_s(
     windows: PredictionWindows, config: SimulatorConfig, values: Mapping[str, FloatArray] | None = None
 ) -> float:
     """Longest accurate integration step [s] of ``simulate_windows`` with the same arguments."""
-    whole, shaped = _by_set(config, values or {})
-    return step_for(windows, whole.kind, shaped, whole.effects)
-
-
-def _of_set(value: FloatArray, k: int, dtype: type[np.floating[Any]]) -> float | FloatArray:
-    """The number of parameter set k, or its row (S,), of a value (P, 1) or (P, S)."""
-    return float(value[k, 0]) if value.shape[1] == 1 else value[k].astype(dtype)
+    whole, numbers, _ = _by_set(config, values or {})
+    return step_for(windows, whole.kind, numbers, whole.effects)
 
 
 def _past_of_hidden_states(
@@ -182,14 +182,14 @@ def _past_of_hidden_states(
     used = [EFFECTS[name] for name in effects]
     if not any(isinstance(effect, DynamicsEffect) and effect.states for effect in used):
         return None
-    past = [measurement.invert_poses(tuple(tick.T)) for tick in windows.past_states.swapaxes(0, 1)]
-    return _stacked(past, max(np.atleast_2d(row).shape[0] for row in past[0]))
+    rows = tuple(windows.past_states.transpose(2, 1, 0)[:, :, None])
+    return np.stack(np.broadcast_arrays(*measurement.invert_poses(rows)), axis=1)
 
 
 def _origins(start: FloatArray, effects: Iterable[str]) -> FloatArray:
-    """Positions and whole turns (6, P, S) to subtract from states (6, P, S), which 32 bits resolve near 0 only.
+    """Positions and whole turns (6, 1 or P, S) to subtract from states of this shape: 32 bits resolve numbers near 0.
 
-    Positions are 0 if an effect depends on the place.
+    Positions are 0 if an effect depends on the place, also one of the measurement.
     """
     origin = np.zeros_like(start)
     if not any("place" in EFFECTS[name].depends_on for name in effects):
@@ -199,14 +199,16 @@ def _origins(start: FloatArray, effects: Iterable[str]) -> FloatArray:
 
 
 def _measured(
-    trajectory: list[State], windows: PredictionWindows, measurement: MeasurementModel, ticks: IndexArray | None
+    trajectory: Mapping[int, State], windows: PredictionWindows, measurement: MeasurementModel, ticks: IndexArray | None
 ) -> list[State]:
     """Measured states of a trajectory of true ones, at some or all ticks."""
+    has_filter = measurement.velocity_time_constant_s is not None
+    past = windows.past_states[:, :, 3:].transpose(1, 2, 0).astype(trajectory[0][3].dtype) if has_filter else ()
     return measurement.measure(
         trajectory,
         windows.period_s,
         window_s2=windows.velocity_window_s2,
-        velocities_before=[tuple(windows.past_states[:, k, 3:].T) for k in range(windows.past_states.shape[1])],
+        velocities_before=[tuple(velocities) for velocities in past],
         ticks=None if ticks is None else ticks.tolist(),
     )
 
@@ -229,26 +231,25 @@ def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:
     return second
 
 
-def _by_set(config: SimulatorConfig, values: Mapping[str, FloatArray]) -> tuple[SimulatorConfig, dict[str, FloatArray]]:
-    """The simulator with the effects of ``values``, and all its parameters, each (P, 1) or (P, S)."""
-    given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in values.items()}
-    sets = max((len(v) for v in given.values()), default=1)
+def _by_set(
+    config: SimulatorConfig, values: Mapping[str, FloatArray]
+) -> tuple[SimulatorConfig, dict[str, float | FloatArray], int]:
+    """The simulator with the effects of ``values``, all its parameters, each a number, (P, 1) or (P, S), and P."""
+    given = {name: _in_columns(value) for name, value in values.items()}
     whole = with_effects_of_values(config, given)
-    numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
-    return whole, {name: _in_columns(value, sets) for name, value in numbers.items()}
+    return whole, {**whole.values(), **given}, max((len(value) for value in given.values()), default=1)
 
 
-def _in_columns(value: float | FloatArray, sets: int) -> FloatArray:
+def _in_columns(value: float | FloatArray) -> FloatArray:
     """A number, (P,) or (P, S) as an array (P, 1) or (P, S)."""
     array = np.asarray(value, dtype=np.float64)
-    return array if array.ndim == 2 else np.broadcast_to(array.reshape(-1, 1), (sets, 1)).copy()
+    return array if array.ndim == 2 else array.reshape(-1, 1)
 
 
-def _stacked(states: Sequence[State], sets: int) -> FloatArray:
-    """Stack states, six rows (P or 1, S) per tick, into one array (ticks, 6, P, S)."""
-    count = states[0][0].shape[-1]
-    stacked = np.empty((len(states), 6, sets, count))
-    for k, state in enumerate(states):
-        for i, row in enumerate(state):
-            stacked[k, i] = row
-    return stacked
+def _stacked(states: Sequence[State], sets: int = 1) -> FloatArray:
+    """Stack states, six rows (S,), (1, S) or (P, S) per tick, into one array (ticks, 6, P, S); ``sets`` is least P."""
+    rows = [np.atleast_2d(row) for state in states for row in state]
+    stacked = np.empty((len(rows), max(sets, *(len(row) for row in rows)), rows[0].shape[1]))
+    for k, row in enumerate(rows):
+        stacked[k] = row
+    return stacked.reshape(len(states), len(states[0]), *stacked.shape[1:])

@@ -32,32 +32,35 @@ _DIFFERENCES = (0.003, 0.03)
 
 
 def step_for(
-    windows: PredictionWindows, kind: ModelKind, values: Mapping[str, FloatArray], effects: Iterable[str]
+    windows: PredictionWindows, kind: ModelKind, values: Mapping[str, float | FloatArray], effects: Iterable[str]
 ) -> float:
     """Integration step [s] of a simulation of S windows by P cars; all have the step of the fastest car.
 
     Args:
         windows: to simulate.
         kind: of the model.
-        values: parameters by dotted name, each (P, 1) or (P, S).
+        values: parameters by dotted name, each a number, (P, 1) or (P, S).
         effects: ids of effects.
     """
     if not (np.abs(windows.measured[:, :, 3]) < SLOW_MPS).any():
         return MAX_STEP_S
-    rate = fastest_rate(kind, {name: value.mean(axis=1) for name, value in values.items()}, effects)
+    means = {name: v.mean(axis=1) if isinstance(v, np.ndarray) else v for name, v in values.items()}
+    rate = fastest_rate(kind, means, effects)
     return float(np.clip(MAX_RATE_TIMES_STEP / max(rate, 1.0), MIN_STEP_S, MAX_STEP_S))
 
 
-def fastest_rate(kind: ModelKind, values: Mapping[str, FloatArray], effects: Iterable[str]) -> float:
+def fastest_rate(kind: ModelKind, values: Mapping[str, float | FloatArray], effects: Iterable[str]) -> float:
     """Largest absolute eigenvalue [1/s] of side speed and yaw rate at the floor of the slip speed, over P cars.
 
-    Arguments are those of ``step_for``, with values (P,). Hidden states of effects are in steady state.
+    Arguments are those of ``step_for``, with numbers or values (P,). Hidden states of effects are in steady state.
     """
     stiffest: ModelKind = "dynamic" if kind == "blend" else kind
-    model = SingleTrack(ARRAYS, stiffest, {name: value[:, None, None] for name, value in values.items()}, effects)
+    by_car = {n: value[:, None, None] if isinstance(value, np.ndarray) else value for n, value in values.items()}
+    model = SingleTrack(ARRAYS, stiffest, by_car, effects)
     vy = SLIP_FLOOR_MPS * np.tan(SLIP_ANGLES) + np.array([0.0, _DIFFERENCES[0], 0.0])[:, None]
     yaw_rate = np.array([0.0, 0.0, _DIFFERENCES[1]])[:, None] + 0.0 * vy
-    still = np.zeros((len(next(iter(values.values()))), *vy.shape))
+    cars = max(len(value) if isinstance(value, np.ndarray) else 1 for value in values.values())
+    still = np.zeros((cars, *vy.shape))
     body = (still, still, still, still + SLIP_FLOOR_MPS, still + vy, still + yaw_rate)
     with np.errstate(all="ignore"):  # parameters of a diverging fit
         rates, _ = model.evaluate(0.0, body, model.actuation(still, still), settle=True)

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import torch
 
+from sim_backends.batch.array_rollout import IntArray
 from sim_backends.batch.rollout import rollout
-from sim_backends.batch.schedule import Number
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.machine_code import FloatRow
 from sim_backends.effects.base import ModelKind
@@ -17,7 +17,7 @@ from sim_backends.effects.base import ModelKind
 def operator_rollout(
     kind: ModelKind,
     effects: Iterable[str],
-    numbers: Mapping[str, Number],
+    numbers: Mapping[str, float | FloatRow],
     start: FloatRow,
     commands: FloatRow,
     ticks: int,
@@ -27,24 +27,41 @@ def operator_rollout(
     t0_s: FloatRow,
     max_step_s: float,
     every: int = 1,
+    returned: IntArray | None = None,
 ) -> FloatRow:
     """``array_rollout`` by torch's operators, for ``report_evaluations``; all rows before the first tick are used."""
-    given = {name: torch.as_tensor(value, dtype=torch.from_numpy(start).dtype) for name, value in numbers.items()}
-    period_s = float(given.pop("timing.control_period"))
-    config = SimulatorConfig(kind=kind, effects={name: {} for name in effects}, control_period_s=period_s)
+    shown = slice(None) if returned is None else returned
+    config = SimulatorConfig(
+        kind=kind, effects={name: {} for name in effects}, control_period_s=float(numbers["timing.control_period"])
+    )
     rows = torch.from_numpy(commands).permute(2, 1, 0)
-    states = rollout(
-        config,
-        torch.from_numpy(start).T,
-        rows[:, before:],
-        history=rows[:, :before],
-        history_states=None if past_states is None else _at_each_tick(past_states, start, every),
-        values=given,
-        t0_s=torch.from_numpy(t0_s),
-        max_step_s=max_step_s,
-        engine="operators",
-    ).states
-    return states[:, ::every].permute(1, 2, 0).numpy()
+    sets = []
+    for k in range(max(len(v) if isinstance(v, np.ndarray) else 1 for v in (*numbers.values(), start[0]))):
+        given = {name: torch.as_tensor(_of_set(v, k), dtype=rows.dtype) for name, v in numbers.items()}
+        own = start[:, k % start.shape[1]]
+        states = rollout(
+            config,
+            torch.from_numpy(own).T,
+            rows[:, before:],
+            history=rows[:, :before],
+            history_states=None
+            if past_states is None
+            else _at_each_tick(past_states[:, :, k % past_states.shape[2]], own, every),
+            values={name: value for name, value in given.items() if name != "timing.control_period"},
+            t0_s=torch.from_numpy(t0_s),
+            max_step_s=max_step_s,
+            engine="operators",
+        ).states
+        sets.append(states[:, ::every].permute(1, 2, 0).numpy()[shown])
+    return np.stack(sets, axis=2)
+
+
+def _of_set(value: float | FloatRow, k: int) -> float | FloatRow:
+    """The number of parameter set k, or its row (N,), of a number, (P, 1) or (P, N)."""
+    if not isinstance(value, np.ndarray):
+        return value
+    own = value[k % len(value)]
+    return own if len(own) > 1 else float(own[0])
 
 
 def _at_each_tick(past_states: FloatRow, start: FloatRow, every: int) -> torch.Tensor:

@@ -143,7 +143,7 @@ def segment_table(
     step: int,
     time: ArrayLike,
     commands: tuple[ArrayLike, ArrayLike],
-    bodies: ArrayLike | None = None,
+    has_bodies: bool = False,
 ) -> NDArray[np.int64]:
     """The table (segments, columns) of a compiled advance; addresses are () or (segments,).
 
@@ -153,10 +153,11 @@ def segment_table(
         step: Address of the row of the step length.
         time: Addresses of the rows of the time at the start.
         commands: Addresses of the rows of steering and throttle.
-        bodies: Addresses of blocks of the state of the body at the start; by default that at the end before.
+        has_bodies: Whether the state of the body at the start is given, by addresses of blocks in the column ``START``
+            (by default of ``ends``), and not that at the end before.
     """
     table = np.empty((len(ends), SegmentTable.OUT + 1), np.int64)
-    columns = (steps, bodies is not None, step, time, *commands, ends if bodies is None else bodies, ends)
+    columns = (steps, has_bodies, step, time, *commands, ends, ends)
     for k, column in enumerate(columns):
         table[:, k] = column
     return table
@@ -173,6 +174,14 @@ def advance_rows(key: Key, rows: Sequence[FloatRow], table: NDArray[np.int64]) -
     if len(table):
         inputs = addresses(rows)
         compile_advance(key, rows[0].dtype).call(len(rows[0]), len(table), inputs.ctypes.data, table.ctypes.data)
+
+
+def advance_blocks(key: Key, blocks: tuple[FloatRow, FloatRow], table: NDArray[np.int64]) -> None:
+    """``advance_rows`` with blocks of contiguous rows: parameters (p, cars), and carried rows at the start."""
+    if len(table):
+        inputs = np.concatenate([address(rows) + rows.strides[0] * np.arange(len(rows)) for rows in blocks])
+        carried = blocks[1]
+        compile_advance(key, carried.dtype).call(carried.shape[1], len(table), inputs.ctypes.data, table.ctypes.data)
 
 
 def advance_tensors(key: Key, steps: int, *inputs: Any) -> tuple[torch.Tensor, ...]:
