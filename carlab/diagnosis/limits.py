@@ -65,14 +65,16 @@ def _limits(
     count = len(linearised.jacobian)
     own = joint.free[count:]
     sizes = np.ones(len(own))
+    fitted = replace(joint, free=joint.free[:count], z=joint.z[:count])
+    held = np.append(fitter.held_at_bounds(fitted, linearised), np.zeros(len(own), bool))
     for _ in range(SECANT_ITERATIONS):
         secants = _secants(fitter, joint, sizes, linearised.white)
         if np.mean(secants**2, axis=(1, 2, 3)).min(initial=math.inf) < MIN_INFORMATION:
             return {}
         jacobian = np.concatenate([linearised.jacobian, secants])
-        step = fitter.gauss_newton_step(joint, Linearisation(jacobian, linearised.white))
+        step = fitter.gauss_newton_step(joint, Linearisation(jacobian, linearised.white), held)
         residual = linearised.white + np.tensordot(step, jacobian, axes=1)
-        covariance = fitter.with_covariance(joint, Linearisation(jacobian, residual)).covariance
+        covariance = fitter.with_covariance(joint, Linearisation(jacobian, residual), held).covariance
         assert covariance is not None
         std = std_factor * np.sqrt(np.diag(covariance)[count:])
         sizes = np.abs(step[count:]) + z90 * std

@@ -65,7 +65,7 @@ def identity_distance(scored: ScoredSearch, effect: str) -> float:
     for k, each in enumerate(fit.free):
         if each.name not in numbers:
             continue
-        value = float(each.value(np.array(fit.z[k])))  # the coordinate may lie beyond a bound
+        value = float(each.value(np.array(fit.z[k])))
         if each.choice:
             if is_stated and value != each.origin:
                 return math.inf

@@ -1,16 +1,26 @@
-"""Bounds of fitted effects: a simulator accepts the values that a fit may reach."""
+"""Bounds of fitted parameters: a simulator accepts the values that a fit may reach, and a fit reaches its minimum."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares, lsq_linear
 
 from carlab.diagnosis.evidence import ScoredSearch, estimate
-from carlab.diagnosis.identification.fit import Fit
-from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.identification.bounded_step import bounded_step, coordinate_bounds, inward_steps
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.fit_parameters import (
+    FitParameter,
+    base_parameters,
+    effect_parameters,
+    with_effect,
+)
 from carlab.diagnosis.settings import DEFAULT
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.effects import EFFECTS
+from tests.helpers.recorded_drives import drive
 
 PROBLEM = SimpleNamespace(settings=DEFAULT, windows=SimpleNamespace(block=np.arange(20)))
 EVERY_CASE = [(kind, effect) for kind in ("dynamic", "linear_tyre", "kinematic") for effect in sorted(EFFECTS)]
@@ -68,3 +78,84 @@ def test_interval_of_a_base_parameter_has_no_error_of_the_model():
         estimate(ScoredSearch(PROBLEM, None, None, fit, {}, False, excess), free[0].name) for excess in (0.0, 1.0)
     )
     assert with_excess.std == pytest.approx(without.std, rel=1e-3)
+
+
+def random_problem(rng, count):
+    """A positive definite matrix, a gradient, and bounds around 0, some of them at 0."""
+    root = rng.normal(size=(2 * count, count))
+    low, high = -rng.uniform(0.0, 0.5, count), rng.uniform(0.0, 0.5, count)
+    low[rng.uniform(size=count) < 0.3] = 0.0
+    return root.T @ root / count, rng.normal(size=count), low, high
+
+
+@pytest.mark.parametrize("count", [1, 6, 25])
+def test_bounded_step_is_the_minimum_of_scipy(count):
+    rng = np.random.default_rng(0)
+    at_bounds = 0
+    for _ in range(100):
+        matrix, gradient, low, high = random_problem(rng, count)
+        step = bounded_step(matrix, gradient, low, high)
+        root = np.linalg.cholesky(matrix).T
+        exact = lsq_linear(root, -np.linalg.solve(root.T, gradient), (low - 1e-12, high + 1e-12), method="bvls").x
+        assert np.all((step >= low) & (step <= high))
+        assert step == pytest.approx(exact, abs=1e-8)
+        at_bounds += np.sum((step == low) | (step == high))
+    assert at_bounds > 10 * count
+
+
+def test_bounded_step_without_a_bound_in_its_way_solves_the_linear_equations():
+    matrix, gradient, low, _ = random_problem(np.random.default_rng(1), 6)
+    step = bounded_step(matrix, gradient, np.full_like(low, -1e3), np.full_like(low, 1e3))
+    assert step == pytest.approx(-np.linalg.solve(matrix, gradient), rel=1e-12)
+
+
+def test_differences_of_a_parameter_are_into_its_range():
+    free = (
+        FitParameter("a", 1.0, 1.0, 0.0, 2.0),
+        FitParameter("b", 1.0, 1.0, 0.0, 2.0),
+        FitParameter("c", 1.0, 1.0, 0.99, 1.02),
+    )
+    steps = np.array([0.1, 0.1, 0.1])
+    assert inward_steps(free, np.array([0.0, 1.0, 0.02]), steps) == pytest.approx([0.1, -0.1, -0.03])
+    assert inward_steps(free, np.array([0.95, -1.0, -0.01]), steps) == pytest.approx([-0.1, 0.1, 0.03])
+
+
+def test_fit_with_parameters_at_their_bounds_reaches_the_minimum_of_scipy():
+    """The true motor is stronger than the car file allows, and its true tyre curve is flatter.
+
+    The priors of both pull back into the range, against the data.
+    """
+    car = SimulatorConfig(priors={"motor.drive_gain": (7.0, 9.0), "tyre.rear.C": (1.3, 2.0)})
+    true = replace(car, priors={}).with_values({"motor.drive_gain": 12.0, "tyre.rear.C": 1.0, "motor.damping": 2.2})
+    windows = cut_windows(segments_of([drive(true, 20.0, 1)]), 0.8, 0.4)
+    free = tuple(f for f in base_parameters(car) if not f.name.startswith("tyre.front"))
+    fitter = Fitter(windows, Scale(np.array([8, 16, 24]), np.tile([0.01, 0.01, 0.02, 0.05, 0.05, 0.1], (3, 1))))
+    low, high = coordinate_bounds(free)
+    precision = np.linalg.cholesky(fitter.precision(free)).T
+
+    def residuals(z):
+        """Huber's loss is half the square of these (both losses are equal within and beyond the threshold)."""
+        return np.concatenate([fitter.white(car, free, z[None])[0].ravel(), precision @ z])
+
+    def loss(z):
+        return float(fitter.huber(fitter.white(car, free, z[None])).sum() + fitter.prior(free, z[None])[0])
+
+    def jacobian(z):
+        ends = [np.clip(z + sign * 0.01 * np.eye(len(z)), low, high) for sign in (1.0, -1.0)]
+        changes = [residuals(a) - residuals(b) for a, b in zip(*ends, strict=True)]
+        return np.stack(changes, axis=1) / np.diag(ends[0] - ends[1])
+
+    huber_delta = DEFAULT.identification.huber_delta
+    exact = least_squares(residuals, 0.0 * low, jacobian, (low, high), loss="huber", f_scale=huber_delta)
+    at_bound = {"motor.drive_gain", "tyre.rear.C"}
+    for start in (np.zeros(len(free)), np.full(len(free), 3.0), np.full(len(free), -3.0)):
+        fit = fitter.fit(car, free, start)
+        assert fit.cost == pytest.approx(loss(fit.z), rel=1e-4)
+        assert fit.cost < loss(exact.x) * 1.003
+        reached = {f.name for f, z, a, b in zip(free, fit.z, low, high, strict=True) if z in (a, b)}
+        assert at_bound <= reached
+        covariance = fitter.with_covariance(fit).covariance
+        for k, f in enumerate(free):
+            assert covariance[k, k] > 0.0
+            if f.name in at_bound:
+                assert not np.delete(covariance[k], k).any()

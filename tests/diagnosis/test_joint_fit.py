@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
-from carlab.diagnosis.identification.fit_parameters import effect_parameters, with_effect
+from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
@@ -62,6 +62,22 @@ def test_joint_fit_is_the_least_squares_fit_of_scipy() -> None:
     expected = by_scipy(windows, start)
     assert abs(found.z[0] - expected) < 0.1 * std
     assert abs(start.z[0] - expected) > 5.0 * std
+
+
+def test_joint_fit_holds_a_parameter_at_its_bound() -> None:
+    """The true lag is 0.05 s, and a car file that states 0.2 s allows at least 0.1 s."""
+    windows = cut_windows(segments_of([drive(TRUE, 8.0, 3)]), 0.8, 2.0)
+    fitter, start = fitted(windows)
+    lag = replace(start.free[0], low=0.1)
+    others = tuple(f for f in base_parameters(CAR) if f.name.startswith("motor."))
+    start = fitter.fit(start.config, (lag, *others), np.array([lag.coordinate(0.15), 0.0, 0.0]))
+    lenient = replace(fitter.settings, joint_max_noise_ratio=math.inf)
+    found = joint_fit(Fitter(windows, SCALE, lenient), replace(start, z=start.z + np.array([0.5, 0.0, 0.0])), STD)
+    assert found is not None
+    assert found.covariance is not None
+    assert found.z[0] == lag.coordinate(0.1)
+    assert not found.covariance[0, 1:].any()
+    assert found.covariance[0, 0] > 0.0
 
 
 @pytest.fixture(scope="module")

@@ -70,3 +70,11 @@ def test_candidate_starts_at_the_values_of_a_fit_whose_effects_have_another_orde
     assert begun.pop("effects.rolling_resistance.force") == 0.3
     assert begun == values
     assert values[f"effects.{LAG}.time_constant"] != values[f"effects.{BRAKE}.gain_ratio"]
+
+
+def test_fits_start_once_for_each_choice_if_one_other_number_is_free() -> None:
+    size, choice = FitParameter("size", 0.0, 1.0, 0.0, 9.0), FitParameter("form", 0.0, 1.0, 0.0, 1.0, choice=True)
+    starts = np.array([[3.0, 1.0], [1.0, 0.0], [2.0, 1.0]])
+    assert refit_module._distinct_starts((size, choice), starts).tolist() == [[3.0, 1.0], [1.0, 0.0]]
+    assert refit_module._distinct_starts((size,), starts[:, :1]).tolist() == [[3.0]]
+    assert refit_module._distinct_starts((size, size), starts).tolist() == starts.tolist()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 
 from carlab.diagnosis.decisions import Condition, Decision
-from carlab.diagnosis.identification.fit import clustered_gain
+from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.diagnosis.selection.refit import refit

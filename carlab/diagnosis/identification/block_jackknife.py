@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from carlab.core.quantities import FloatArray
@@ -34,6 +35,20 @@ def jackknife_covariance(information: FloatArray, scores: FloatArray, precision:
     of_blocks = zip(information, scores, strict=True)
     changes = np.array([np.linalg.lstsq(normal - matrix, score, rcond=None)[0] for matrix, score in of_blocks])
     return np.asarray((count - 1) / count * changes.T @ changes)
+
+
+def covariance_within_bounds(
+    information: FloatArray, scores: FloatArray, precision: FloatArray, held: NDArray[np.bool_]
+) -> FloatArray:
+    """``jackknife_covariance`` of the parameters that no bound holds, for fixed values of the ``held`` ones (n,).
+
+    A held parameter has the variance that it would have without its bound, and no covariance.
+    """
+    covariance = np.diag(np.where(held, np.diag(jackknife_covariance(information, scores, precision)), 0.0))
+    free = np.ix_(~held, ~held)
+    if not held.all():
+        covariance[free] = jackknife_covariance(information[:, ~held][:, :, ~held], scores[:, ~held], precision[free])
+    return covariance
 
 
 def sandwich_design_effects(information: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:

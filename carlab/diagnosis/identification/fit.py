@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
-from carlab.diagnosis.identification.block_jackknife import jackknife_covariance, sandwich_design_effects
+from carlab.diagnosis.identification.block_jackknife import covariance_within_bounds, sandwich_design_effects
+from carlab.diagnosis.identification.bounded_step import (
+    bounded_step,
+    coordinate_bounds,
+    held_at_bounds,
+    inward_steps,
+)
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
@@ -71,13 +77,14 @@ class Scale:
 
 MAX_STEP = 8.0
 """Maximum change of a coordinate in an iteration."""
+MAX_DAMPING_AT_END = 1.0
+"""Damping, relative to the diagonal, above which a small gain is no sign of a minimum: the step was short."""
 _MAX_WHITE = 1e4
 
 
 def bounded(white: FloatArray) -> FloatArray:
     """Whitened errors (...) of which none is infinite or NaN, as those of a diverged simulation are."""
-    finite = np.nan_to_num(white, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
-    return finite.clip(-_MAX_WHITE, _MAX_WHITE)
+    return np.fmax(np.fmin(white, _MAX_WHITE), -_MAX_WHITE)  # of NaN and a number, these return the number
 
 
 def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
@@ -169,12 +176,12 @@ class Fitter:
     ) -> FloatArray:
         """Derivatives (n, S, U, 6) of the whitened errors ``white`` (S, U, 6) at coordinates z (n,), by differences.
 
-        Only windows that a parameter may influence are simulated for it.
+        At a bound they are those into the range. Only windows that a parameter may influence are simulated for it.
         """
         values = values_at(free, z)
         influences = influencing_parameters(self.windows, config, values)
         max_step_s = longest_step_s(self.windows, config, values)
-        steps = difference_steps(free)
+        steps = inward_steps(free, z, difference_steps(free))
         jacobian = np.zeros((len(free), *white.shape))
         everywhere = influences.all(axis=1)
         moved = z + np.diag(steps)[everywhere]
@@ -236,31 +243,31 @@ class Fitter:
         iterations: int = 12,
         tolerance: float = 2e-4,
     ) -> Fit:
-        """Minimise Huber loss plus prior from ``start`` (n,) (zeros unless given)."""
+        """Minimise Huber loss plus prior within the bounds of the parameters, from ``start`` (n,) (zeros unless given).
+
+        The method is Levenberg-Marquardt with an active set of bounds (``bounded_step``).
+        """
         count = len(free)
         z = np.zeros(count) if start is None else np.array(start, dtype=np.float64)
         if count == 0:
             loss = self.loss(config)
             return Fit(config, (), z, float(loss.sum()), loss)
         free = tuple(free)
+        low, high = coordinate_bounds(free)
+        z = z.clip(low, high)
         precision = self.precision(free)
         white = self.white(config, free, z[None])[0]
         cost = float(self.huber(white).sum() + self.prior(free, z[None])[0])
         damping = 1e-2
         for _ in range(iterations):
-            jacobian = self.jacobian(config, free, z, white)
-            flat, residual = jacobian.reshape(count, -1), white.reshape(-1)
-            weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(residual), 1e-12))
-            normal = (flat * weight) @ flat.T + precision
-            gradient = flat @ (weight * residual) + precision @ z
+            normal, gradient = self._normal(self.jacobian(config, free, z, white), white)
+            normal, gradient = normal + precision, gradient + precision @ z
+            lowest, highest = np.maximum(low - z, -MAX_STEP), np.minimum(high - z, MAX_STEP)
             improved = False
             for _ in range(3):
                 dampings = damping * np.array([0.1, 1.0, 10.0, 100.0])
-                trials = []
-                for value in dampings:
-                    matrix = normal + value * np.diag(np.diag(normal) + 1e-9)
-                    trials.append(z - np.linalg.solve(matrix, gradient))
-                tried = np.clip(np.array(trials), z - MAX_STEP, z + MAX_STEP)
+                matrices = [normal + value * np.diag(np.diag(normal) + 1e-9) for value in dampings]
+                tried = z + np.array([bounded_step(matrix, gradient, lowest, highest) for matrix in matrices])
                 whites = self.white(config, free, tried)
                 costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
                 best = int(np.argmin(costs))
@@ -271,38 +278,53 @@ class Fitter:
                     damping = max(float(dampings[best]), 1e-6)
                     break
                 damping *= 1e3
-            if not improved or gain < tolerance * cost:
+            if not improved or (gain < tolerance * cost and damping <= MAX_DAMPING_AT_END):
                 break
         fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
         loss = self.huber(white).sum(axis=(1, 2))
         return Fit(fitted, free, z, cost, np.asarray(loss))
 
-    def with_covariance(self, fit: Fit, linearisation: Linearisation | None = None) -> Fit:
+    def with_covariance(
+        self, fit: Fit, linearisation: Linearisation | None = None, held: NDArray[np.bool_] | None = None
+    ) -> Fit:
         """The same fit with its covariance by the jackknife over blocks (``block_jackknife``).
 
         Args:
             fit: n parameters.
             linearisation: of the errors at the fit; computed by default.
+            held: parameters (n,) that a bound holds; by default ``held_at_bounds``. Their design effect is 0.
         """
         if not fit.free:
             return replace(fit, covariance=np.zeros((0, 0)), design_effects=np.zeros(0))
-        jacobian, white = linearisation or self.linearised(fit)
+        linearisation = linearisation or self.linearised(fit)
+        held = self.held_at_bounds(fit, linearisation) if held is None else held
+        jacobian, white = linearisation
         masks = [self.windows.block == block for block in np.unique(self.windows.block)]
         parts = [self._information(jacobian[:, mask], white[mask]) for mask in masks]
         information = np.array([matrix for matrix, _ in parts])
         scores = np.array([score.sum(axis=1) for _, score in parts])
         precision = self.precision(fit.free)
-        return replace(
-            fit,
-            covariance=jackknife_covariance(information, scores, precision),
-            design_effects=sandwich_design_effects(information, scores, precision),
-        )
+        covariance = covariance_within_bounds(information, scores, precision, held)
+        effects, own = np.zeros(len(fit.free)), np.ix_(~held, ~held)
+        effects[~held] = sandwich_design_effects(information[:, ~held][:, :, ~held], scores[:, ~held], precision[own])
+        return replace(fit, covariance=covariance, design_effects=effects)
 
-    def gauss_newton_step(self, fit: Fit, linearisation: Linearisation) -> FloatArray:
-        """Change (n,) of the coordinates of a fit that minimises the linearised loss with its prior."""
-        information, score = self._information(*linearisation)
+    def held_at_bounds(self, fit: Fit, linearisation: Linearisation) -> NDArray[np.bool_]:
+        """Which parameters (n,) of a fit are at a bound beyond which its cost would fall."""
+        gradient = self._normal(*linearisation)[1] + self.precision(fit.free) @ fit.z
+        return held_at_bounds(fit.free, fit.z, gradient)
+
+    def gauss_newton_step(self, fit: Fit, linearisation: Linearisation, held: NDArray[np.bool_]) -> FloatArray:
+        """Change (n,) of the coordinates of a fit that minimises the linearised loss with its prior.
+
+        Bounds do not limit it, but coordinates that are ``held`` (n,) do not change.
+        """
+        normal, gradient = self._normal(*linearisation)
         precision = self.precision(fit.free)
-        return np.asarray(-np.linalg.pinv(information + precision) @ (score.sum(axis=1) + precision @ fit.z))
+        step, free = np.zeros(len(fit.free)), ~held
+        matrix = (normal + precision)[np.ix_(free, free)]
+        step[free] = -np.linalg.pinv(matrix) @ (gradient + precision @ fit.z)[free]
+        return step
 
     def leave_fold_out_loss(
         self, fit: Fit, folds: IndexArray, max_error: float, linearisation: Linearisation | None = None
@@ -344,12 +366,13 @@ class Fitter:
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         information, score = self._information(jacobian, white)
         normal = information + self.precision(fit.free)
+        low, high = coordinate_bounds(fit.free)
         for name in np.unique(folds):
             own = folds == name
             part = jacobian[:, own].reshape(len(fit.free), -1)
             reduced = normal - (part * weight[own].reshape(-1)) @ part.T
             reduced = reduced + 1e-3 * np.diag(np.diag(normal) + 1e-9)
-            step = np.linalg.solve(reduced, score[:, own].sum(axis=1))
+            step = bounded_step(reduced, -score[:, own].sum(axis=1), low - fit.z, high - fit.z)
             step *= min(1.0, self.settings.max_fold_step / max(float(np.abs(step).max()), 1e-12))
             trials = fit.z + np.array(self.settings.fold_step_shares)[:, None] * step
             whites = self.white(fit.config, fit.free, trials)
@@ -362,31 +385,14 @@ class Fitter:
         white = self.white(fit.config, fit.free, fit.z[None])[0]
         return Linearisation(self.jacobian(fit.config, fit.free, fit.z, white), white)
 
+    def _normal(self, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton matrix (n, n) and gradient (n,) of the loss without the prior."""
+        flat, residual = jacobian.reshape(len(jacobian), white.size), white.reshape(-1)
+        weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(residual), 1e-12))
+        return (flat * weight) @ flat.T, flat @ (weight * residual)
+
     def _information(self, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix (n, n) without the prior, and each window's score (n, S)."""
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         flat = jacobian.reshape(len(jacobian), -1)
         return (flat * weight.reshape(-1)) @ flat.T, (jacobian * (weight * white)[None]).sum(axis=(2, 3))
-
-
-def clustered_gain(before: FloatArray, after: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
-    """Fall of the loss from ``before`` to ``after`` (S,) and its standard error, clustered by block."""
-    gain = before - after
-    blocks, index = np.unique(windows.block, return_inverse=True)
-    sums = np.bincount(index, weights=gain, minlength=len(blocks))
-    error = math.sqrt(len(blocks)) * float(sums.std(ddof=1)) if len(blocks) > 1 else math.inf
-    return float(gain.sum()), max(error, 1e-9)
-
-
-def design_effect_of(fit: Fit, effect: str) -> float:
-    """Design effect of an effect's parameters: variance by blocks over that for independent errors, at least one.
-
-    Twice the gain of several parameters is a sum of chi-squares weighted by such ratios, so their mean divides it
-    (Kent 1982). The median of all parameters replaces it if that of the effect is undefined (a limit never reached).
-    """
-    assert fit.design_effects is not None
-    own = [
-        float(d) for f, d in zip(fit.free, fit.design_effects, strict=True)
-        if f.name.startswith(f"effects.{effect}.") and d > 1e-9
-    ]  # fmt: skip
-    return max(fit.design_effect, float(np.mean(own)) if own else 0.0)

@@ -16,9 +16,16 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.block_jackknife import jackknife_covariance
+from carlab.diagnosis.identification.block_jackknife import covariance_within_bounds
+from carlab.diagnosis.identification.bounded_step import (
+    bounded_step,
+    coordinate_bounds,
+    held_at_bounds,
+    inward_steps,
+)
 from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter, bounded, huber
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
 from carlab.diagnosis.identification.free_initial_states import (
@@ -120,9 +127,10 @@ def _iterated(problem: _Problem, point: _Point, precision: FloatArray) -> tuple[
     normal += precision
     gradient = gradient + precision @ point.z
     diagonal = np.diag(np.diag(normal) + 1e-9)
-    steps = [-np.linalg.solve(normal + damping * diagonal, gradient) for damping in _DAMPINGS]
-    for step in (*steps, np.zeros(len(gradient))):
-        change = step.clip(-MAX_STEP, MAX_STEP)
+    low, high = coordinate_bounds(problem.free)
+    lowest, highest = np.maximum(low - point.z, -MAX_STEP), np.minimum(high - point.z, MAX_STEP)
+    steps = [bounded_step(normal + damping * diagonal, gradient, lowest, highest) for damping in _DAMPINGS]
+    for change in (*steps, np.zeros(len(gradient))):
         followed = point.states + np.einsum("skn,n->sk", following, change) * problem.std
         trial = _trial(problem, point.z + change, followed, at.shift, precision)
         if trial.cost < point.cost:
@@ -148,22 +156,23 @@ def _result(problem: _Problem, point: _Point, precision: FloatArray) -> Fit:
     """The fit with the covariance of its parameters."""
     fitter, free, z = problem.fitter, problem.free, point.z
     at = problem.linearised(z, point.states)
-    covariance = _covariance(at, fitter.windows.block, precision)
+    gradient = _normal(at.projected()[0], at)[1] + precision @ z
+    covariance = _covariance(at, fitter.windows.block, precision, held_at_bounds(free, z, gradient))
     config = problem.config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
     loss = fitter.loss(config)
     cost = float(loss.sum() + fitter.prior(free, z[None])[0])
     return Fit(config, free, z, cost, loss, covariance)
 
 
-def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) -> FloatArray:
-    """Covariance (n, n) by the jackknife over blocks."""
+def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
+    """Covariance (n, n) by the jackknife over blocks; bounds hold the ``held`` parameters (n,)."""
     jacobian = at.projected()[0]
     parts = [
         _normal(jacobian[own], replace(at, white=at.white[own], weights=at.weights[own]))
         for own in (block == each for each in np.unique(block))
     ]
     information, scores = (np.array(each) for each in zip(*parts, strict=True))
-    return jackknife_covariance(information, scores, precision)
+    return covariance_within_bounds(information, scores, precision, held)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +213,7 @@ class _Problem:
 
     def linearised(self, z: FloatArray, states: FloatArray) -> _Linearisation:
         """Errors at the best initial states near ``states`` (S, 6), and derivatives."""
-        steps = difference_steps(self.free)
+        steps = inward_steps(self.free, z, difference_steps(self.free))
         moved_z = np.vstack([z, np.tile(z, (6, 1)), z + np.diag(steps)])
         moved_states = np.tile(states, (len(moved_z), 1, 1))
         moved_states[1:7] += _STATE_STEP * np.diag(self.std)[:, None]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale, clustered_gain
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,
@@ -22,6 +22,7 @@ from carlab.diagnosis.identification.fit_parameters import (
     stated_effects,
     with_effect,
 )
+from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import is_applicable
 from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import DEFAULT, QuickSettings

@@ -12,7 +12,8 @@ import math
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision
-from carlab.diagnosis.identification.fit import Fitter, clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit_candidate
 from carlab.diagnosis.selection.screening import ScreeningResult, screen_candidates

@@ -8,8 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from carlab.diagnosis.identification.fit import design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
+from carlab.diagnosis.identification.gains import design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_with_scale, refit_candidate, refit_without_each
 from carlab.diagnosis.selection.screening import Screen

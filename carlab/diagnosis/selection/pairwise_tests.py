@@ -12,9 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Linearisation, Scale, clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit import Fit, Linearisation, Scale
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.delay_groups import confusable_shared_delays
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem

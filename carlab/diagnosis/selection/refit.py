@@ -70,13 +70,14 @@ def _fit_from(problem: SearchProblem, effects: tuple[str, ...], start: FloatArra
 def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
     """Fit the candidate together with ``model``, from the initial points of its screening.
 
-    The initial points are compared after a few iterations on part of the windows.
+    The initial points are compared after a few iterations on part of the windows. Those of an effect with one number
+    differ in size alone, and fits from them end at the same minimum, so the best of them stands for all.
     """
     fitter = problem.fitter(model.scale)
     effects = (*model.effects, screened.effect)
     config, free = problem.config_with(effects), problem.free_parameters(effects)
     before = _start(problem, model.effects, model.fit)
-    starts = [np.concatenate([before, s]) for s in screened.starts]
+    starts = [np.concatenate([before, s]) for s in _distinct_starts(free[len(before) :], screened.starts)]
     if len(starts) > 1:
         settings = problem.settings.selection
         few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
@@ -84,6 +85,15 @@ def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningRes
         starts = [min(tries, key=lambda f: f.cost).z]
     fit = fitter.fit(config, free, starts[0])
     return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
+
+
+def _distinct_starts(own: Sequence[FitParameter], starts: FloatArray) -> FloatArray:
+    """The initial points (k, n) of an effect's parameters, one for each choice if a single other number is free."""
+    choices = np.array([f.choice for f in own], bool)
+    if len(own) - choices.sum() > 1:
+        return starts
+    _, first = np.unique(starts[:, choices], axis=0, return_index=True)
+    return starts[np.sort(first)]
 
 
 def fit_with_scale(

@@ -16,7 +16,8 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
-from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit import Fit
+from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.delay_groups import effect_of_each_command, group_lags_s
 from carlab.diagnosis.selection.elimination import EliminationResult, eliminate
 from carlab.diagnosis.selection.pairwise_tests import left_out_loss
