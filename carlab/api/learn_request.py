@@ -51,7 +51,7 @@ class LearnRequest:
     task: str | Task | None = None
     track: Path | str | None = None
     ticks: int | None = None
-    prior: str | Path | CarFile = "kinematic"
+    prior: str | Path | CarFile = "nominal"
     method: Method = "gp-sim-posterior"
     particles: Particles = "network"
     history: int | None = None

@@ -134,7 +134,7 @@ def learn(
         track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
         ticks: control periods (ticks) per episode, more than ``history``; by default the task's number.
-        prior: the prior simulator: ``kinematic`` (the default), ``nominal``, or a car file such as a diagnosed model.
+        prior: the prior simulator: ``nominal`` (the default), ``kinematic``, or a car file such as a diagnosed model.
             ``auto`` starts with the nominal one; between episodes, effects and parameters that the recordings support
             are added to it, and those that the recordings contradict are removed.
         method: ``gp-sim-posterior`` (the default): particles of a Gaussian-process posterior around the simulator

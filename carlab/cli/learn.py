@@ -70,7 +70,7 @@ class Learn:
     ticks: int | None = ARGUMENT_DEFAULT
 
     prior: str | None = ARGUMENT_DEFAULT
-    """The prior simulator: kinematic (the default: the car file without wheel slip), nominal (the car file), auto, or
+    """The prior simulator: nominal (the default: the car file), kinematic (the car file without wheel slip), auto, or
     FILE.toml (for example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and
     parameters that the recordings support are added to the prior, and those that they contradict are removed; the run
     prints each change. Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle

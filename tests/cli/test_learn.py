@@ -138,7 +138,7 @@ def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Pat
         ("--no-place", "--no-place: this run was started with --place; remove the option"),
         ("--out runs", "--out: a resumed run stays in its folder; remove the option."),
         ("--name learn", "--name: a resumed run stays in its folder; remove the option."),
-        ("--prior nominal", "--prior: this run was started with another prior; remove the option, or start a new"),
+        ("--prior kinematic", "--prior: this run was started with another prior; remove the option, or start a new"),
         ("--prior auto", "--prior: this run was started with another prior; remove the option, or start a new"),
     ],
 )
