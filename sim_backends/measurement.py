@@ -130,7 +130,7 @@ class MeasurementModel:
             filtered: Output of the filter at the first tick; by default the filter starts settled.
             ticks: Indices of the ticks to return; all by default.
         """
-        last = (max(trajectory) if isinstance(trajectory, Mapping) else len(trajectory) - 1) if trajectory else -1
+        last = max(trajectory, default=-1) if isinstance(trajectory, Mapping) else len(trajectory) - 1
         wanted = range(last + 1) if ticks is None else ticks
         observed = functools.cache(lambda k: self.observe(trajectory[k]))
 

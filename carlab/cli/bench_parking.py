@@ -40,7 +40,7 @@ from learning.world.car_fit import Method
 
 RUNS = "runs"
 """Folder of the runs in the folder of a job."""
-LOW_FIDELITY = "kinematic"
+LOW_FIDELITY_PRIOR = "kinematic"
 """Prior of the comparison of methods, as in the paper: it differs from the simulated car."""
 
 
@@ -180,7 +180,7 @@ def _runs(options: BenchOptions) -> list[_Run]:
     methods = [m for m in get_args(Method) if m in options.methods or not options.methods]
     if unknown := [m for m in options.methods if m not in get_args(Method)]:
         raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(get_args(Method))}.")
-    return [_Run(m, seed, {"method": m, "prior": LOW_FIDELITY}) for seed, m in itertools.product(seeds, methods)]
+    return [_Run(m, seed, {"method": m, "prior": LOW_FIDELITY_PRIOR}) for seed, m in itertools.product(seeds, methods)]
 
 
 def _report(curves: list[Curve], options: BenchOptions) -> None:

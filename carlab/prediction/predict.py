@@ -140,7 +140,7 @@ def simulate_windows(
     states = simulate(
         whole.kind,
         effects,
-        _true_car(numbers, effects, measurement) | {"timing.control_period": windows.period_s / parts},
+        _car_without_measurement(numbers, effects, measurement) | {"timing.control_period": windows.period_s / parts},
         (start - origin).astype(dtype),
         commands,
         windows.steps * parts,
@@ -159,7 +159,7 @@ def simulate_windows(
     return predicted.transpose(2, 3, 0, 1)
 
 
-def _true_car(
+def _car_without_measurement(
     numbers: Mapping[str, float | FloatArray], effects: Sequence[str], measurement: MeasurementModel
 ) -> dict[str, Any]:
     """Numbers of the car without its measurement; commands act later by the latency of the measurement."""

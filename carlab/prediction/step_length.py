@@ -14,6 +14,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.array_ops import ARRAYS
+from sim_backends.batch.array_rollout import count_of_sets
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.effects.base import SLIP_FLOOR_MPS, ModelKind
 
@@ -59,8 +60,7 @@ def fastest_rate(kind: ModelKind, values: Mapping[str, float | FloatArray], effe
     model = SingleTrack(ARRAYS, stiffest, by_car, effects)
     vy = SLIP_FLOOR_MPS * np.tan(SLIP_ANGLES) + np.array([0.0, _DIFFERENCES[0], 0.0])[:, None]
     yaw_rate = np.array([0.0, 0.0, _DIFFERENCES[1]])[:, None] + 0.0 * vy
-    cars = max(len(value) if isinstance(value, np.ndarray) else 1 for value in values.values())
-    still = np.zeros((cars, *vy.shape))
+    still = np.zeros((count_of_sets(values.values()), *vy.shape))
     body = (still, still, still, still + SLIP_FLOOR_MPS, still + vy, still + yaw_rate)
     with np.errstate(all="ignore"):  # parameters of a diverging fit
         rates, _ = model.evaluate(0.0, body, model.actuation(still, still), settle=True)

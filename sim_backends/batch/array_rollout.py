@@ -72,7 +72,7 @@ def array_rollout(
         past_states = None if past_states is None else past_states[..., repeated]
         t0_s = t0_s[repeated] if isinstance(t0_s, np.ndarray) else t0_s
         start, commands = (np.ascontiguousarray(array[..., repeated]) for array in (start, commands))
-    sets = max(len(v) if isinstance(v, np.ndarray) else 1 for v in (*numbers.values(), start[0]))
+    sets = count_of_sets((*numbers.values(), start[0]))
     shown = np.arange(ticks // every + 1) if returned is None else returned
     states = np.empty((len(shown), BODY_ROWS, sets, start.shape[-1]), start.dtype)
     if states.size and shown[0] == 0:
@@ -104,14 +104,19 @@ def _sets_by_delay(
     names = [COMMAND_DELAY, *(f"effects.{e}.{p.name}" for e in delays for p in EFFECTS[e].parameters)]
     groups: dict[Any, tuple[tuple[Number, Number], list[int]]] = {}
     for k in range(sets):
-        delays_s = total_delays_s({name: _number_or_tensor(numbers[name], k) for name in names}, delays)
+        delays_s = total_delays_s({name: number_of_set(numbers[name], k) for name in names}, delays)
         has_rows = any(isinstance(delay_s, torch.Tensor) for delay_s in delays_s)
         groups.setdefault(k if has_rows else delays_s, (delays_s, []))[1].append(k)
     return ((delays_s, np.array(chosen)) for delays_s, chosen in groups.values())
 
 
-def _number_or_tensor(value: float | FloatRow, k: int) -> Number:
-    """The value of parameter set k."""
+def count_of_sets(values: Iterable[float | FloatRow]) -> int:
+    """Number P of parameter sets of numbers, (P, 1) and (P, N)."""
+    return max(len(value) if isinstance(value, np.ndarray) else 1 for value in values)
+
+
+def number_of_set(value: float | FloatRow, k: int) -> Number:
+    """The number of parameter set k, or its tensor (N,), of a number, (P, 1) or (P, N)."""
     if not isinstance(value, np.ndarray):
         return value
     own = value[k % len(value)]
@@ -221,7 +226,7 @@ class _ArrayRollout:
         self,
         key: Key,
         carried: FloatRow,
-        kept: int,
+        stored: int,
         blocks: IntArray,
         *,
         first: int = 0,
@@ -232,16 +237,16 @@ class _ArrayRollout:
         Args:
             key: Of the compiled function.
             carried: Rows at the start (carried, G, N).
-            kept: Number of ends of periods that are kept.
-            blocks: Index (n,) of each end among these, or ``kept``.
+            stored: Number of ends of periods that are stored.
+            blocks: Index (n,) of each end among these, or ``stored``.
             first: Number of the first period; the first tick begins period 0.
             bodies: States of the body (n // every + 1, 6, 1 or G, N), interpolated at the start of each piece.
 
         Yields:
-            Index of the parameter set, and its carried rows at the ends (kept, carried, N), valid until the next.
+            Index of the parameter set, and its carried rows at the ends (stored, carried, N), valid until the next.
         """
         parameters = self._rows(tuple(self.numbers[name] for name in trace_step(key).parameters))
-        ends = np.empty((kept + 1, len(carried), carried.shape[2]), carried.dtype)
+        ends = np.empty((stored + 1, len(carried), carried.shape[2]), carried.dtype)
         used, starts = list[FloatRow](), list[FloatRow]()  # the compiled code has their addresses only
         table = self._table(key, ends, blocks, first, bodies is not None, used)
         for k in range(self.sets):

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import torch
 
-from sim_backends.batch.array_rollout import IntArray
+from sim_backends.batch.array_rollout import IntArray, count_of_sets, number_of_set
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.machine_code import FloatRow
@@ -36,8 +36,8 @@ def operator_rollout(
     )
     rows = torch.from_numpy(commands).permute(2, 1, 0)
     sets = []
-    for k in range(max(len(v) if isinstance(v, np.ndarray) else 1 for v in (*numbers.values(), start[0]))):
-        given = {name: torch.as_tensor(_of_set(v, k), dtype=rows.dtype) for name, v in numbers.items()}
+    for k in range(count_of_sets((*numbers.values(), start[0]))):
+        given = {name: torch.as_tensor(number_of_set(v, k), dtype=rows.dtype) for name, v in numbers.items()}
         own = start[:, k % start.shape[1]]
         states = rollout(
             config,
@@ -54,14 +54,6 @@ def operator_rollout(
         ).states
         sets.append(states[:, ::every].permute(1, 2, 0).numpy()[shown])
     return np.stack(sets, axis=2)
-
-
-def _of_set(value: float | FloatRow, k: int) -> float | FloatRow:
-    """The number of parameter set k, or its row (N,), of a number, (P, 1) or (P, N)."""
-    if not isinstance(value, np.ndarray):
-        return value
-    own = value[k % len(value)]
-    return own if len(own) > 1 else float(own[0])
 
 
 def _at_each_tick(past_states: FloatRow, start: FloatRow, every: int) -> torch.Tensor:

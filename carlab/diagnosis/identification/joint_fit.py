@@ -44,7 +44,6 @@ _DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0)
 """Levenberg-Marquardt dampings, relative to the diagonal; the first that lowers the cost is used."""
 _STATE_STEP = 0.05
 """Difference of the initial states for derivatives, in standard deviations of the noise."""
-"""Bound of a whitened error, as in ``fit.Fitter``."""
 _NORMAL_MEDIAN_SQUARE = 0.4549
 """Median of the square of a standard normal variable."""
 

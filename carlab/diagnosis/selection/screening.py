@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.bounded_step import coordinate_bounds
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
@@ -93,7 +94,7 @@ class Screen:
         if (scaled := EFFECTS[effect].screening_scaled) is not None:
             scalable = np.array([f.name.rpartition(".")[2] in scaled for f in free])
         factor = np.clip(along[order], *settings.step_range)[:, None]
-        low, high = _limits(free)
+        low, high = coordinate_bounds(free)
         starts = np.where(scalable, points[order] * factor, points[order]).clip(low, high)
         return ScreeningResult(effect, float(gains[order[0]]) / self.share, starts)
 
@@ -159,14 +160,8 @@ def _points_along(
     free: Sequence[FitParameter], directions: FloatArray, is_scaled: NDArray[np.bool_], sizes: FloatArray
 ) -> FloatArray:
     """Points (D, W, n) along each of the directions (D, n) at its sizes (D, W), within the bounds of the parameters."""
-    low, high = _limits(free)
+    low, high = coordinate_bounds(free)
     return np.where(is_scaled, sizes[:, :, None] * directions[:, None], directions[:, None]).clip(low, high)
-
-
-def _limits(free: Sequence[FitParameter]) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest coordinates (n,) of the parameters."""
-    low, high = np.sort([[f.coordinate(v) for v in (f.low, f.high)] for f in free], axis=1).T
-    return low, high
 
 
 def _sizes_along(points: FloatArray, directions: FloatArray, is_scaled: NDArray[np.bool_]) -> FloatArray:
