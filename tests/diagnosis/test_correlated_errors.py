@@ -9,7 +9,7 @@ from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.selection.correlated_errors import decorrelating, without_unsupported_effects
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import fit_base, fit_with_scale

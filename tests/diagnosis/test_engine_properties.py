@@ -12,7 +12,8 @@ from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.selection.elimination import eliminate

@@ -9,7 +9,8 @@ from scipy.optimize import least_squares, lsq_linear
 
 from carlab.diagnosis.evidence import ScoredSearch, estimate
 from carlab.diagnosis.identification.bounded_step import bounded_step, coordinate_bounds, inward_steps
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,

@@ -11,7 +11,8 @@ import carlab
 from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
-from carlab.diagnosis.identification.fit import Fit, Scale, huber
+from carlab.diagnosis.identification.error_scale import Scale, huber
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise

@@ -8,7 +8,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.prediction.errors import prediction_errors

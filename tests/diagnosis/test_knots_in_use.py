@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlab.diagnosis.identification.fit import Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.fit_parameters import difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.selection.problem import SearchProblem

@@ -7,7 +7,7 @@ import pytest
 
 from carlab.diagnosis.evidence import ScoredSearch
 from carlab.diagnosis.findings import Estimate, FigureData
-from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.limits import effect_limits

@@ -14,7 +14,8 @@ from carlab.diagnosis.curves.simulator_with_curves import simulator_with_curves
 from carlab.diagnosis.curves.support import curve_findings, driving_time_s
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.findings import CurveAxis, CurveFinding, CurveTrial, FigureData, RejectedCurves
-from carlab.diagnosis.identification.fit import Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.sentences import with_unit

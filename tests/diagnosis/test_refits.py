@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.problem import Model, SearchProblem

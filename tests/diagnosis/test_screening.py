@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from carlab.diagnosis.identification.fit import Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.fit_parameters import effect_parameters, with_effect
 from carlab.diagnosis.selection.screening import Screen, size_of_change
 from carlab.diagnosis.settings import DEFAULT

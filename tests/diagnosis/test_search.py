@@ -16,7 +16,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.findings import SearchExtent
-from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection import refit as refit_module

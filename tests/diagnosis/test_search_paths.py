@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from carlab.diagnosis.identification.fit import Fit, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection import forward
 from carlab.diagnosis.selection.forward import Choice, Path, best_path, extend
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem

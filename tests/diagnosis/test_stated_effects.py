@@ -11,7 +11,8 @@ from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, Estimate, Evidence
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
 from carlab.diagnosis.report.write import completed, with_parameter_std

@@ -8,7 +8,8 @@ from scipy.special import huber as huber_loss
 
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import ScoredSearch
-from carlab.diagnosis.identification.fit import Fit, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise

@@ -9,7 +9,8 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import RejectedCurves
-from carlab.diagnosis.identification.fit import Fit, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.prediction.errors import prediction_errors

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
-from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.identification.block_jackknife import covariance_within_bounds, sandwich_design_effects
 from carlab.diagnosis.identification.bounded_step import (
     bounded_step,
@@ -23,6 +22,7 @@ from carlab.diagnosis.identification.bounded_step import (
     held_at_bounds,
     inward_steps,
 )
+from carlab.diagnosis.identification.error_scale import Scale, huber
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
@@ -32,65 +32,10 @@ from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CURVES
 
-
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """Standard deviations that whiten errors: ``sigma`` (U, 6) by step and channel, and the ``steps`` (U,).
-
-    ``sigma`` has the units of the errors: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]. ``root`` (6 U, 6 U)
-    decorrelates the errors of a window in standard deviations; without it, they count as independent.
-    """
-
-    steps: np.ndarray
-    sigma: FloatArray
-    root: FloatArray | None = None
-
-    @classmethod
-    def of(
-        cls,
-        error: FloatArray,
-        floor: FloatArray,
-        share: float = 1.0,
-        settings: IdentificationSettings = DEFAULT.identification,
-    ) -> Scale:
-        """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
-        last = error.shape[1] - 1
-        steps = np.unique(np.linspace(last / settings.loss_steps, last, settings.loss_steps).round().astype(int))
-        spread = STD_OVER_MAD * np.median(np.abs(error[:, steps]), axis=0)
-        return cls(steps, np.maximum(share * spread, floor))
-
-    def white(self, error: FloatArray) -> FloatArray:
-        """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
-        return self.white_at_steps(error[..., self.steps, :])
-
-    def white_at_steps(self, error: FloatArray) -> FloatArray:
-        """Whitened errors (..., U, 6) of errors (..., U, 6) at the steps; none is infinite or NaN."""
-        white = bounded(error / self.sigma)
-        if self.root is None:
-            return white
-        return bounded((white.reshape(*white.shape[:-2], -1) @ self.root).reshape(white.shape))
-
-    def as_bytes(self) -> tuple[bytes, ...]:
-        """The content, to compare scales by."""
-        return tuple(b"" if each is None else each.tobytes() for each in (self.steps, self.sigma, self.root))
-
-
 MAX_STEP = 8.0
 """Maximum change of a coordinate in an iteration."""
 MAX_DAMPING_AT_END = 1.0
 """Damping, relative to the diagonal, above which a small gain is no sign of a minimum: the step was short."""
-_MAX_WHITE = 1e4
-
-
-def bounded(white: FloatArray) -> FloatArray:
-    """Whitened errors (...) of which none is infinite or NaN, as those of a diverged simulation are."""
-    return np.fmax(np.fmin(white, _MAX_WHITE), -_MAX_WHITE)  # of NaN and a number, these return the number
-
-
-def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
-    """Huber's loss of whitened errors (...), element by element; it is linear from ``delta`` on."""
-    size = np.abs(white)
-    return np.where(size <= delta, 0.5 * white**2, delta * size - 0.5 * delta**2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import bounded, huber
+from carlab.diagnosis.identification.error_scale import bounded, huber
 from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.errors import prediction_errors

@@ -11,7 +11,7 @@ from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.core.recording_noise import RecordingNoise, StateStd
 from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.findings import FitErrors
-from carlab.diagnosis.identification.fit import huber
+from carlab.diagnosis.identification.error_scale import huber
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings

@@ -26,7 +26,8 @@ from carlab.diagnosis.identification.bounded_step import (
     held_at_bounds,
     inward_steps,
 )
-from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter, bounded, huber
+from carlab.diagnosis.identification.error_scale import bounded, huber
+from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
 from carlab.diagnosis.identification.free_initial_states import (
     initial_state_correction,

@@ -15,7 +15,7 @@ import numpy as np
 
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.error_model import ErrorModel
-from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.selection.elimination import delete_each
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Linearisation, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Linearisation
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of

@@ -10,7 +10,8 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Decision
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,

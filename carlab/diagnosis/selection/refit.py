@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, values_at
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult

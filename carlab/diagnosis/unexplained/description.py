@@ -14,7 +14,8 @@ import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import Unexplained
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
 from carlab.diagnosis.unexplained.residual_terms import TERMS, Term, responses

@@ -14,7 +14,7 @@ import numpy as np
 
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows
