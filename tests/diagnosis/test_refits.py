@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter
+from carlab.diagnosis.selection import candidates
 from carlab.diagnosis.selection import refit as refit_module
-from carlab.diagnosis.selection.problem import Model, SearchProblem
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
 from carlab.diagnosis.selection.screening import ScreeningResult
+from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
@@ -79,3 +82,69 @@ def test_fits_start_once_for_each_choice_if_one_other_number_is_free() -> None:
     assert refit_module._distinct_starts((size, choice), starts).tolist() == [[3.0, 1.0], [1.0, 0.0]]
     assert refit_module._distinct_starts((size,), starts[:, :1]).tolist() == [[3.0]]
     assert refit_module._distinct_starts((size, size), starts).tolist() == starts.tolist()
+
+
+def test_fit_that_is_compared_ends_early_with_nearly_the_same_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the lag, the base parameters explain a part of it in several iterations."""
+    problem, scale = short_problem()
+    fitter, free = problem.fitter(scale), problem.free_parameters(())
+    true = fitter.fit(problem.config_with((LAG,)), problem.free_parameters((LAG,)))
+    iterations: list[int] = []
+    jacobian = Fitter.jacobian
+
+    def counted(own: Fitter, config: SimulatorConfig, *given: Any) -> FloatArray:
+        iterations[-1] += 1
+        return jacobian(own, config, *given)
+
+    def fitted(compared_cost: float | None) -> Fit:
+        iterations.append(0)
+        return fitter.fit(CAR, free, tolerance=1e-6, iterations=30, compared_cost=compared_cost)
+
+    monkeypatch.setattr(Fitter, "jacobian", counted)
+    exact, early = fitted(None), fitted(true.cost)
+    equal = fitted(exact.cost)
+    assert iterations[1] < iterations[0] / 2
+    assert iterations[2] == iterations[0]
+    assert early.cost - true.cost == pytest.approx(exact.cost - true.cost, rel=0.05)
+    assert equal.cost == pytest.approx(exact.cost, rel=1e-5)
+
+
+@pytest.fixture
+def finished(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Effects whose fits are begun, and those whose fits are finished."""
+    calls: list[list[str]] = [[], []]
+    for name, own in (("begin_refit", calls[0]), ("finish_refit", calls[1])):
+        refit_of = getattr(refit_module, name)
+
+        def counted(problem: SearchProblem, model: Model, part: Any, of: Any = refit_of, own: Any = own) -> Candidate:
+            own.append(part.effect)
+            return of(problem, model, part)
+
+        monkeypatch.setattr(candidates, name, counted)
+    return calls
+
+
+@pytest.mark.parametrize("accept_chi2_min", [25.0, 1e9])
+def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
+    finished: list[list[str]], accept_chi2_min: float
+) -> None:
+    """This car has three effects: the steering's lag, which the model has, the motor's lag, and a small misalignment."""
+    small = {"motor_lag": {"time_constant": 0.15}, "mocap_yaw_misalignment": {"angle": 0.02}}
+    true = replace(CAR, effects={LAG: {"time_constant": 0.05}, **small})
+    windows = cut_windows(segments_of([drive(true, 10.0, 3)]), 0.8, 0.5)
+    limit = replace(
+        DEFAULT.selection, accept_chi2_min=accept_chi2_min, steady_z_min=accept_chi2_min, min_score_share=0.0
+    )
+    problem = SearchProblem(CAR, windows, 3.0 * STD, STD, {}, tuple(small), replace(DEFAULT, selection=limit))
+    model = refit(problem, (LAG,), problem.fitter(short_problem()[1]).fit(CAR, ()), short_problem()[1])
+    found = candidates.next_candidates(problem, model, RunControl())
+    begun, complete = finished
+    assert found[0].effect == complete[0] == "motor_lag"
+    assert len(begun) > 1
+    if accept_chi2_min < 1e9:
+        assert set(complete) < set(begun)
+        assert set(complete) == {c.effect for c in found}
+    else:
+        assert set(complete) == set(begun) == {c.effect for c in found}
+    full = refit(problem, (LAG, "motor_lag"), found[0].fit, model.scale)
+    assert found[0].gain == pytest.approx(model.fit.cost - full.fit.cost, rel=0.03)

@@ -111,9 +111,11 @@ def test_result_is_the_same_with_two_processes(drag: Case, tmp_path: Path, monke
     """One process repeats no refit, although four stages remove each effect."""
     fits: list[bytes] = []
 
-    def counted(problem: SearchProblem, effects: tuple[str, ...], start: np.ndarray, scale: Scale) -> Model:
-        fits.append(repr((effects, start.tolist(), scale.sigma.tolist())).encode())
-        return fit_from(problem, effects, start, scale)
+    def counted(
+        problem: SearchProblem, effects: tuple[str, ...], start: np.ndarray, scale: Scale, compared: float | None = None
+    ) -> Model:
+        fits.append(repr((effects, start.tolist(), scale.sigma.tolist(), compared)).encode())
+        return fit_from(problem, effects, start, scale, compared)
 
     fit_from = refit_module._fit_from
     settings = replace(FEWER, selection=replace(LENIENT, min_practical_size=0.0))

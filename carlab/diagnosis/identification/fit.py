@@ -187,10 +187,20 @@ class Fitter:
         *,
         iterations: int = 12,
         tolerance: float = 2e-4,
+        compared_cost: float | None = None,
     ) -> Fit:
-        """Minimise Huber loss plus prior within the bounds of the parameters, from ``start`` (n,) (zeros unless given).
+        """Minimise Huber loss plus prior within the bounds of the parameters.
 
         The method is Levenberg-Marquardt with an active set of bounds (``bounded_step``).
+
+        Args:
+            config: simulator.
+            free: n parameters.
+            start: their initial coordinates (n,); zeros unless given.
+            iterations: maximum number.
+            tolerance: the fit ends when an iteration lowers the cost by less than this share of it.
+            compared_cost: cost of a model that the fit is compared with. The fit also ends when an iteration lowers the
+                cost by less than ``compared_tolerance`` of the difference.
         """
         count = len(free)
         z = np.zeros(count) if start is None else np.array(start, dtype=np.float64)
@@ -223,7 +233,9 @@ class Fitter:
                     damping = max(float(dampings[best]), 1e-6)
                     break
                 damping *= 1e3
-            if not improved or (gain < tolerance * cost and damping <= MAX_DAMPING_AT_END):
+            difference = 0.0 if compared_cost is None else abs(cost - compared_cost)
+            smallest = max(tolerance * cost, self.settings.compared_tolerance * difference)
+            if not improved or (gain < smallest and damping <= MAX_DAMPING_AT_END):
                 break
         fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
         loss = self.huber(white).sum(axis=(1, 2))

@@ -9,41 +9,64 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import refit_candidate
+from carlab.diagnosis.selection.refit import begin_refit, finish_refit
 from carlab.diagnosis.selection.screening import ScreeningResult, screen_candidates
 
 log = logging.getLogger(__name__)
 
+Part = TypeVar("Part", ScreeningResult, Candidate)
+
 
 def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -> tuple[Candidate, ...]:
-    """Refitted candidates, sorted by gain; those tested on left-out blocks come first."""
+    """Refitted candidates, sorted by gain; those tested on left-out blocks come first.
+
+    After the first effect, candidates with a small gain after the first iterations are finished and tested only if none
+    of the others is accepted.
+    """
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
     screened = screen_candidates(problem, model, names, control)
     fitter = problem.fitter(model.scale)
     linearisation = fitter.linearised(model.fit)
     chosen = _to_refit(problem, screened, fitter.with_covariance(model.fit, linearisation).design_effect)
+    begun = _mapped(begin_refit, problem, model, chosen, control)
+    if not begun:
+        return ()
+    settings = problem.settings.selection
+    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_left_out_error, linearisation)
+    min_gain = settings.min_first_gain_share * max(c.gain for c in begun) if model.effects else -math.inf
+    found: tuple[Candidate, ...] = ()
+    for part in ([c for c in begun if c.gain >= min_gain], [c for c in begun if c.gain < min_gain]):
+        refitted = sorted(_mapped(finish_refit, problem, model, part, control), key=lambda c: -c.gain)
+        found = _tested(problem, model, (*found, *refitted), reference, control)
+        if any(is_accepted(problem, c) for c in found):
+            break
+    return found
+
+
+def _mapped(
+    refit: Callable[[SearchProblem, Model, Part], Candidate],
+    problem: SearchProblem,
+    model: Model,
+    parts: Sequence[Part],
+    control: RunControl,
+) -> list[Candidate]:
+    """Fits of candidates by the workers; fewer if the search is to end."""
     done, steps = len(model.effects), problem.settings.selection.max_effects
     fitted = control.workers.map(
-        refit_candidate,
-        [(problem.without_refits(), model, result) for result in chosen],
+        refit,
+        [(problem.without_refits(), model, part) for part in parts],
         stop=control.ends_search,
-        started=lambda k: control.progress(
-            f"refitting with {chosen[k].effect}", (done + 0.5 * k / len(chosen)) / steps
-        ),
+        started=lambda k: control.progress(f"refitting with {parts[k].effect}", (done + 0.5 * k / len(parts)) / steps),
     )
-    refitted = [candidate for candidate in fitted if candidate is not None]
-    refitted.sort(key=lambda c: -c.gain)
-    if not refitted:
-        return ()
-    limit = problem.settings.selection.max_left_out_error
-    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), limit, linearisation)
-    return _tested(problem, model, refitted, reference, control)
+    return [candidate for candidate in fitted if candidate is not None]
 
 
 def _to_refit(
@@ -63,26 +86,27 @@ def _to_refit(
 
 
 def _tested(
-    problem: SearchProblem, model: Model, refitted: list[Candidate], reference: FloatArray, control: RunControl
+    problem: SearchProblem, model: Model, refitted: Sequence[Candidate], reference: FloatArray, control: RunControl
 ) -> tuple[Candidate, ...]:
     """Test the candidates with the largest gains on left-out blocks; ``reference`` (S,) is the loss of the model."""
     settings = problem.settings.selection
     fitter = problem.fitter(model.scale)
-    min_gain = settings.min_gain_share * refitted[0].gain
-    count = sum(c.gain >= min_gain or k < 2 for k, c in enumerate(refitted))
+    by_gain = sorted(refitted, key=lambda c: -c.gain)
+    min_gain = settings.min_gain_share * by_gain[0].gain if by_gain else 0.0
+    new = [c for k, c in enumerate(by_gain) if (c.gain >= min_gain or k < 2) and not c.is_tested]
     share = (len(model.effects) + 0.7) / settings.max_effects
     tested = control.workers.map(
         with_left_out_gain,
-        [(problem.without_refits(), fitter, candidate, reference) for candidate in refitted[:count]],
+        [(problem.without_refits(), fitter, candidate, reference) for candidate in new],
         stop=control.ends_search,
-        started=lambda k: control.progress(f"cross-validating {refitted[k].effect}", share),
+        started=lambda k: control.progress(f"cross-validating {new[k].effect}", share),
     )
-    found = [new or old for new, old in zip(tested, refitted[:count], strict=True)] + refitted[count:]
-    found.sort(key=lambda c: (not c.is_tested, -(c.gain + c.left_out_gain)))
-    for c in found:
-        if c.is_tested:
+    for c in tested:
+        if c is not None:
             _log(problem, model, c)
-    return tuple(found)
+    by_effect = {c.effect: c for c in tested if c is not None}
+    found = [by_effect.get(c.effect, c) for c in by_gain]
+    return tuple(sorted(found, key=lambda c: (not c.is_tested, -(c.gain + c.left_out_gain))))
 
 
 def with_left_out_gain(

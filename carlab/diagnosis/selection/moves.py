@@ -23,7 +23,8 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
         return model
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
     significant: dict[str, Model] = {}
-    for name, reduced in refit_without_each(problem, model, control, model.effects[:-1]).items():
+    without_each = refit_without_each(problem, model, control, model.effects[:-1], is_comparison=True)
+    for name, reduced in without_each.items():
         chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(with_covariance, name)
         if chi2 < problem.settings.selection.keep_chi2_min:
             swapped = _swap(problem, model, significant, control)

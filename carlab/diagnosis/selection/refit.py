@@ -28,17 +28,26 @@ def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale:
 
 
 def refit_without_each(
-    problem: SearchProblem, model: Model, control: RunControl, names: Sequence[str] | None = None
+    problem: SearchProblem,
+    model: Model,
+    control: RunControl,
+    names: Sequence[str] | None = None,
+    *,
+    is_comparison: bool = False,
 ) -> dict[str, Model]:
-    """For each effect of a model (or each of ``names``), the model without it, refitted."""
+    """For each effect of a model (or each of ``names``), the model without it, refitted.
+
+    A refit for comparison only ends where the difference of the costs is known well enough (``Fitter.fit``).
+    """
     removed = model.effects if names is None else names
     others = {name: tuple(e for e in model.effects if e != name) for name in removed}
     starts = {name: _start(problem, effects, model.fit) for name, effects in others.items()}
-    keys = {name: _key(problem, effects, starts[name], model.scale) for name, effects in others.items()}
+    cost = model.fit.cost if is_comparison else None
+    keys = {name: _key(problem, effects, starts[name], model.scale, cost) for name, effects in others.items()}
     new = [name for name in removed if keys[name] not in problem.refits]
     fitted = control.workers.map(
         _fit_from,
-        [(problem.without_refits(), others[name], starts[name], model.scale) for name in new],
+        [(problem.without_refits(), others[name], starts[name], model.scale, cost) for name in new],
         started=lambda k: control.progress(f"refitting without {new[k]}", 0.93),
     )
     problem.refits.update((keys[name], each) for name, each in zip(new, fitted, strict=True) if each is not None)
@@ -51,10 +60,19 @@ def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> Fl
     return np.array([known.get(f.name, 0.0) for f in problem.free_parameters(effects)])
 
 
-def _key(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
-    """Starting values by name, and the scale: what a refit depends on. The order of effects changes rounding only."""
+def _key(
+    problem: SearchProblem,
+    effects: tuple[str, ...],
+    start: FloatArray,
+    scale: Scale,
+    compared_cost: float | None = None,
+) -> Hashable:
+    """What a refit depends on: starting values by name, the scale and the cost that it is compared with.
+
+    The order of effects changes rounding only.
+    """
     names = (f.name for f in problem.free_parameters(effects))
-    return frozenset(zip(names, start.tolist(), strict=True)), scale.as_bytes()
+    return frozenset(zip(names, start.tolist(), strict=True)), scale.as_bytes(), compared_cost
 
 
 def _in_order(problem: SearchProblem, model: Model, effects: tuple[str, ...]) -> Model:
@@ -63,29 +81,59 @@ def _in_order(problem: SearchProblem, model: Model, effects: tuple[str, ...]) ->
     return replace(model, effects=effects, fit=replace(model.fit, free=free, z=z))
 
 
-def _fit_from(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Model:
-    free = problem.free_parameters(effects)
-    return Model(effects, problem.fitter(scale).fit(problem.config_with(effects), free, start), scale)
+def _fit_from(
+    problem: SearchProblem,
+    effects: tuple[str, ...],
+    start: FloatArray,
+    scale: Scale,
+    compared_cost: float | None = None,
+) -> Model:
+    config, free = problem.config_with(effects), problem.free_parameters(effects)
+    return Model(effects, problem.fitter(scale).fit(config, free, start, compared_cost=compared_cost), scale)
 
 
 def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
-    """Fit the candidate together with ``model``, from the initial points of its screening.
+    """Fit the candidate together with ``model``, from the initial points of its screening."""
+    fitter = problem.fitter(model.scale)
+    config, free, start = _candidate_start(problem, model, screened)
+    fit = fitter.fit(config, free, start)
+    return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
+
+
+def begin_refit(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
+    """The first iterations of ``refit_candidate``."""
+    fitter = problem.fitter(model.scale)
+    config, free, start = _candidate_start(problem, model, screened)
+    fit = fitter.fit(config, free, start, iterations=problem.settings.selection.first_iterations)
+    return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
+
+
+def finish_refit(problem: SearchProblem, model: Model, begun: Candidate) -> Candidate:
+    """The further iterations of a candidate's fit, to compare it with the model and with other candidates."""
+    config = problem.config_with((*model.effects, begun.effect))
+    cost = model.fit.cost
+    fit = problem.fitter(model.scale).fit(config, begun.fit.free, begun.fit.z, compared_cost=cost)
+    return Candidate(begun.effect, fit, cost - fit.cost)
+
+
+def _candidate_start(
+    problem: SearchProblem, model: Model, screened: ScreeningResult
+) -> tuple[SimulatorConfig, tuple[FitParameter, ...], FloatArray]:
+    """The simulator with a candidate, its n parameters and their initial coordinates (n,).
 
     The initial points are compared after a few iterations on part of the windows. Those of an effect with one number
     differ in size alone, and fits from them end at the same minimum, so the best of them stands for all.
     """
-    fitter = problem.fitter(model.scale)
     effects = (*model.effects, screened.effect)
     config, free = problem.config_with(effects), problem.free_parameters(effects)
     before = _start(problem, model.effects, model.fit)
     starts = [np.concatenate([before, s]) for s in _distinct_starts(free[len(before) :], screened.starts)]
-    if len(starts) > 1:
-        settings = problem.settings.selection
-        few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
-        tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
-        starts = [min(tries, key=lambda f: f.cost).z]
-    fit = fitter.fit(config, free, starts[0])
-    return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
+    if len(starts) == 1:
+        return config, free, starts[0]
+    settings = problem.settings.selection
+    few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
+    tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
+    return config, free, min(tries, key=lambda f: f.cost).z
 
 
 def _distinct_starts(own: Sequence[FitParameter], starts: FloatArray) -> FloatArray:

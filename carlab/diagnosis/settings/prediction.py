@@ -45,6 +45,9 @@ class IdentificationSettings:
     """Whitened error [standard deviations] from which Huber's loss is linear (Huber 1964)."""
     loss_steps: int = 6
     """Steps of a window whose errors enter the loss."""
+    compared_tolerance: float = 0.02
+    """A fit that is compared with another model ends when an iteration lowers its cost by less than this share of the
+    difference of their costs."""
     max_fold_step: float = 4.0
     """Maximum step of a coordinate when a fold is removed from a fit."""
     fold_step_shares: tuple[float, ...] = (1.0, 0.5, 0.2)

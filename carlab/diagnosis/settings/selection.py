@@ -48,6 +48,10 @@ class SelectionSettings:
     """A candidate is refitted if its screening score is at least this share of the best."""
     min_score_chi2: float = 8.0
     """A candidate is refitted if twice its score over the design effect is at least this."""
+    first_iterations: int = 1
+    """Number of iterations of a candidate's fit after which candidates are compared for the first time."""
+    min_first_gain_share: float = 0.5
+    """A candidate's fit is finished if its gain after these iterations is at least this share of the best."""
     min_gain_share: float = 0.3
     """A refitted candidate is tested on left-out blocks if its gain is at least this share of the best."""
     max_left_out_error: float = 12.0
