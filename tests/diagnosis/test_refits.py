@@ -12,7 +12,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter
-from carlab.diagnosis.selection import candidates
+from carlab.diagnosis.selection import candidates, moves
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
@@ -128,7 +128,7 @@ def finished(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
     finished: list[list[str]], accept_chi2_min: float
 ) -> None:
-    """This car has three effects: the steering's lag, which the model has, the motor's lag, and a small misalignment."""
+    """The model has the lag of the steering. The car also has a lag of the motor and a misalignment."""
     small = {"motor_lag": {"time_constant": 0.15}, "mocap_yaw_misalignment": {"angle": 0.02}}
     true = replace(CAR, effects={LAG: {"time_constant": 0.05}, **small})
     windows = cut_windows(segments_of([drive(true, 10.0, 3)]), 0.8, 0.5)
@@ -148,3 +148,27 @@ def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
         assert set(complete) == set(begun) == {c.effect for c in found}
     full = refit(problem, (LAG, "motor_lag"), found[0].fit, model.scale)
     assert found[0].gain == pytest.approx(model.fit.cost - full.fit.cost, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "other", "chi2", "replaced"),
+    [
+        ("motor_lag", "throttle_delay", 20.0, True),
+        ("motor_lag", "throttle_delay", 15.0, False),
+        ("motor_lag", "longitudinal_slip", 20.0, False),
+        ("motor_lag", "longitudinal_slip", 40.0, True),
+        ("longitudinal_slip", "motor_lag", 20.0, True),
+    ],
+)
+def test_swap_with_an_effect_of_more_numbers_needs_a_higher_chi2(
+    monkeypatch: pytest.MonkeyPatch, name: str, other: str, chi2: float, replaced: bool
+) -> None:
+    """Slipping wheels have one number more than a lag, and an infinite identity."""
+    problem, scale = short_problem()
+    problem = replace(problem, confusable={name: (other,)})
+    nothing = Model((), problem.fitter(scale).fit(CAR, ()), scale)
+    swap = Candidate(other, nothing.fit, 0.0), chi2
+    monkeypatch.setattr(moves, "_fitted_swap", lambda *given: swap)
+    monkeypatch.setattr(moves, "fit_with_scale", lambda problem, effects, *given: Model(effects, nothing.fit, scale))
+    model = moves._swap(problem, Model((name,), nothing.fit, scale), {name: nothing}, RunControl())
+    assert (model.effects if model is not None else (name,)) == ((other,) if replaced else (name,))

@@ -153,12 +153,32 @@ def is_accepted(problem: SearchProblem, candidate: Candidate) -> bool:
 def accepted(
     problem: SearchProblem, model: Model, candidates: tuple[Candidate, ...], control: RunControl
 ) -> tuple[Candidate, ...]:
-    """The candidates that are accepted, the best first; records the decision about each tested one."""
+    """The candidates that are accepted, the next effect first; records the decision about each tested one.
+
+    The best is next, unless an accepted candidate that is confusable with it is simpler and not distinguished from it:
+    the rule of one standard error (Breiman et al. 1984).
+    """
     tested = [c for c in candidates if c.is_tested]
     for c in tested:
         conditions = acceptance(problem, c)
         control.record(Decision("accept", c.effect, conditions, is_accepted(problem, c), len(model.effects)))
-    return tuple(c for c in tested if is_accepted(problem, c))
+    chosen = [c for c in tested if is_accepted(problem, c)]
+    if not chosen:
+        return ()
+    best = chosen[0]
+    simpler = [c for c in chosen if c is best or _is_simpler(problem, c, best)]
+    simplest = min(simpler, key=lambda c: problem.required_chi2(c.effect))
+    return (simplest, *(c for c in chosen if c is not simplest))
+
+
+def _is_simpler(problem: SearchProblem, candidate: Candidate, best: Candidate) -> bool:
+    """Whether a confusable candidate has fewer parameters, and a loss on left-out blocks that is not distinguished."""
+    if candidate.effect not in problem.confusable.get(best.effect, ()):
+        return False
+    if problem.required_chi2(candidate.effect) >= problem.required_chi2(best.effect):
+        return False
+    lead, error = clustered_gain(candidate.left_out_loss, best.left_out_loss, problem.windows)
+    return lead < problem.settings.selection.simpler_z_max * error
 
 
 def _log(problem: SearchProblem, model: Model, c: Candidate) -> None:

@@ -70,12 +70,17 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     ]
     swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
     for (name, _), swap in zip(pairs, swaps, strict=True):
-        if swap is not None and swap[1] > settings.keep_chi2_min:
+        if swap is not None and swap[1] > settings.keep_chi2_min + _more_numbers_chi2(problem, swap[0].effect, name):
             candidate, chi2 = swap
             log.info("%s replaces %s (chi2 %.1f)", candidate.effect, name, chi2)
             fit, effects = candidate.fit, (*reduced[name].effects, candidate.effect)
             return fit_with_scale(problem, effects, fit.config, fit.free, fit.z)
     return None
+
+
+def _more_numbers_chi2(problem: SearchProblem, other: str, name: str) -> float:
+    """Additional chi2 of an effect that replaces one with fewer numbers."""
+    return max(problem.required_chi2(other) - problem.required_chi2(name), 0.0)
 
 
 def _fitted_swap(

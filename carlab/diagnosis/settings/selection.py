@@ -69,6 +69,9 @@ class SelectionSettings:
     """Alternative: minimum gain on left-out blocks [standard errors] together with ``steady_left_out_share``."""
     steady_left_out_share: float = 0.03
     """Alternative: minimum gain on left-out blocks, as a share of the loss of a perfect simulator."""
+    simpler_z_max: float = 1.0
+    """A simpler candidate that is confusable with the best one is accepted in its place if its loss on left-out blocks
+    is higher by less than this [standard errors]."""
     keep_chi2_min: float = 16.0
     """Minimum chi2 of an earlier effect after others were added, and minimum chi2 of a swap."""
     swap_score_share: float = 0.7
