@@ -1,5 +1,6 @@
 """Shared fixtures: seeded random generator, folder of reference data, CUDA stand-in, check for leaked threads."""
 
+import gc
 import importlib.util
 import os
 import sys
@@ -22,6 +23,20 @@ os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--hil", action="store", default=None, metavar="CAR.toml", help="also test this real car")
+
+
+gc.disable()  # until the tests are collected: imports make many objects and no garbage
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Search less often for garbage, and not among modules and tests."""
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.set_threshold(50_000, 10, 10)
+        gc.enable()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
