@@ -1,5 +1,6 @@
 """Drives of the independent generator with planted events: blows, blows that only turn the car, lifts."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -36,8 +37,9 @@ class EventDrive:
         return sum(not own for own in near), len(found) - len({k for own in near for k in own})
 
 
+@functools.cache
 def event_drive(seed: int, kind: str = "", *, length_s: float = 60.0, period_s: float = 1 / 30) -> EventDrive:
-    """Drive a car with events every 4 to 8 s.
+    """Drive a car with events every 4 to 8 s. Tests share the result, so they do not change it.
 
     Args:
         seed: of everything that is drawn.
