@@ -14,6 +14,7 @@ from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.world.driver import HumanDriver, Track
 from carlab.benchmark.world.measurement import Noise, as_table, record, write_csv
 from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import Drive as SimulatedDrive
 from carlab.benchmark.world.simulation import drive as simulated_drive
 from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import diagnose
@@ -112,13 +113,21 @@ def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
     assert wrong_correction[5] < 0.3 * right_correction[5]
 
 
-@pytest.mark.parametrize("window_s", [0.06, 0.075, 0.09])
-def test_velocity_window_is_estimated(plain: Drive, tmp_path: Path, window_s: float) -> None:
-    """A drive at 120 Hz is differentiated by parabolas over a window; the variance is width^2 / 20."""
+@pytest.fixture(scope="module")
+def finely_driven(plain: Drive) -> tuple[World, SimulatedDrive]:
+    """A drive of a minute with the true car of the case."""
     car = plain.case.true_car
     world, course = World(car), Track(np.random.default_rng(5))
     human = HumanDriver(car, course, np.random.default_rng(6))
-    driven = simulated_drive(world, human, 60.0, start=human.start())
+    return world, simulated_drive(world, human, 60.0, start=human.start())
+
+
+@pytest.mark.parametrize("window_s", [0.06, 0.075, 0.09])
+def test_velocity_window_is_estimated(
+    plain: Drive, finely_driven: tuple[World, SimulatedDrive], tmp_path: Path, window_s: float
+) -> None:
+    """A drive at 120 Hz is differentiated by parabolas over a window; the variance is width^2 / 20."""
+    car, (world, driven) = plain.case.true_car, finely_driven
     noise = Noise(car.position_std, car.yaw_std, window_s)
     write_csv(tmp_path / "drive.csv", as_table(record(driven, world, noise, np.random.default_rng(7))))
     windows = cut_windows(segments_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
