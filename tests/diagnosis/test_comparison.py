@@ -19,6 +19,8 @@ from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
+SECONDS = 60.0
+"""Length of a recording; a comparison needs 50 s."""
 CANDIDATES = (
     *("steering_lag", "steering_offset", "motor_lag", "command_delay", "throttle_nonlinearity"),
     *("motor.drive_gain", "steering.max_angle", "tyre.rear.mu"),
@@ -32,20 +34,31 @@ def with_unknown_physics(config: SimulatorConfig) -> SimulatorConfig:
 
 @pytest.fixture(scope="module")
 def first():
-    return drive(with_unknown_physics(CAR), 90.0, 21)
+    return drive(with_unknown_physics(CAR), SECONDS, 21)
 
 
 def second(config: SimulatorConfig, seed: int = 22):
-    return drive(with_unknown_physics(config), 90.0, seed)
+    return drive(with_unknown_physics(config), SECONDS, seed)
+
+
+@pytest.fixture(scope="module")
+def unchanged():
+    """A second recording of the same car."""
+    return second(CAR)
 
 
 LAG_S = 0.08
 
 
 @pytest.fixture(scope="module")
-def slower_servo(first):
-    slow = with_effect(CAR, "steering_lag").with_values({"effects.steering_lag.time_constant": LAG_S})
-    return compare([first], [second(slow)], CAR, candidates=CANDIDATES)
+def slower():
+    """A recording of the car with a slower servo."""
+    return second(with_effect(CAR, "steering_lag").with_values({"effects.steering_lag.time_constant": LAG_S}))
+
+
+@pytest.fixture(scope="module")
+def slower_servo(first, slower):
+    return compare([first], [slower], CAR, candidates=CANDIDATES)
 
 
 def test_change_is_named_with_its_size_although_the_simulator_lacks_physics(slower_servo):
@@ -81,12 +94,11 @@ def test_stop_without_a_change_is_inconclusive(first):
     assert stopped.sentence == "The comparison was stopped before it found a change. Compare again for a result."
 
 
-def test_stop_after_a_change_is_stated(first, slower_servo):
-    slow = with_effect(CAR, "steering_lag").with_values({"effects.steering_lag.time_constant": LAG_S})
+def test_stop_after_a_change_is_stated(first, slower, slower_servo):
     activities = []
     stopped = compare(
         [first],
-        [second(slow)],
+        [slower],
         CAR,
         candidates=("steering_lag", "motor_lag", "motor.drive_gain"),
         progress=lambda activity, share: activities.append(activity),
@@ -99,10 +111,10 @@ def test_stop_after_a_change_is_stated(first, slower_servo):
     assert "stopped" not in slower_servo.sentence
 
 
-def test_result_that_cannot_be_written_is_refused_with_one_sentence(first, tmp_path):
+def test_result_that_cannot_be_written_is_refused_with_one_sentence(first, unchanged, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file"):
-        carlab.compare([first], [second(CAR)], "sim", out=tmp_path / "file" / "out", stop=lambda: True)
+        carlab.compare([first], [unchanged], "sim", out=tmp_path / "file" / "out", stop=lambda: True)
 
 
 def test_unusable_groups_are_refused_with_one_sentence(first):
@@ -141,8 +153,8 @@ def test_verb_without_a_verdict_has_the_exit_code_of_a_diagnosis_without_one(fir
     assert undecided.sentence in capsys.readouterr().err
 
 
-def test_verb_writes_the_result_of_the_call(first, tmp_path, capsys):
-    paths = csv_files(tmp_path, first, second(CAR))
+def test_verb_writes_the_result_of_the_call(first, unchanged, tmp_path, capsys):
+    paths = csv_files(tmp_path, first, unchanged)
     arguments = ["compare", str(paths[0]), "--with", str(paths[1]), "--candidates", "motor_lag", "steering_offset"]
     assert run([*arguments, "--out", str(tmp_path / "out")]) == 0
     assert "No effect or parameter of the simulator changed significantly" in capsys.readouterr().out
