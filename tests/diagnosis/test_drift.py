@@ -19,7 +19,7 @@ from tests.helpers.changing_drives import changing_drive
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CONFIG = SimulatorConfig(control_period_s=PERIOD_S)
-SECONDS = 60.0
+SECONDS = 40.0
 
 
 def drift_of(fit, held_out, config=CONFIG):
