@@ -1,5 +1,6 @@
 """Artificial diagnoses with each verdict and data for their figures, for the tests of the report."""
 
+import functools
 import math
 from dataclasses import replace
 
@@ -47,6 +48,11 @@ def _weave(t: NDArray, start: NDArray, angle: float, lag_s: float) -> NDArray:
 
 
 def trace(name: str = "recording 1") -> Trace:
+    return replace(_trace(), name=name)
+
+
+@functools.cache
+def _trace() -> Trace:
     t, recorded = drive(0.11)
     predicted: dict[str, NDArray] = {}
     for model, lag_s in (("nominal", 0.0), ("refit", 0.03), ("with_effects", 0.10)):
@@ -55,7 +61,7 @@ def trace(name: str = "recording 1") -> Trace:
             part = slice(first, first + 30)
             rows[part] = _weave(t[part], recorded[first], float(np.arctan(recorded[first, 5] * 0.15)), lag_s)
         predicted[model] = rows
-    return Trace(name, t, recorded, predicted, ((4.0, 5.0), (9.0, 10.0), (17.0, 18.0)))
+    return Trace("", t, recorded, predicted, ((4.0, 5.0), (9.0, 10.0), (17.0, 18.0)))
 
 
 def lag_finding() -> EffectFinding:

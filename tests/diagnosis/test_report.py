@@ -40,6 +40,14 @@ def case(request: pytest.FixtureRequest) -> Diagnosis:
     return material.CASES[request.param]
 
 
+@pytest.fixture(scope="module", params=sorted(material.CASES))
+def written_case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a diagnosis with each verdict, with all figures."""
+    folder = tmp_path_factory.mktemp("case")
+    write_report(material.CASES[request.param], material.figure_data(), folder, material.model())
+    return folder
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("reports") / "new" / "folder"
@@ -129,9 +137,8 @@ def test_numbers_that_are_not_finite_become_null(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["seconds"] is None
 
 
-def test_page_is_one_file_without_scripts_and_external_references(case: Diagnosis, tmp_path: Path) -> None:
-    write_report(case, material.figure_data(), tmp_path, material.model())
-    text, page = read_page(tmp_path)
+def test_page_is_one_file_without_scripts_and_external_references(written_case: Path) -> None:
+    text, page = read_page(written_case)
     assert not {"script", "link", "img", "iframe", "object", "embed"} & set(page.tags)
     assert not {"src", "href", "xlink:href", "srcset"} & {name for name, _ in page.attributes}
     assert not [name for name, _ in page.attributes if name.startswith("on")]
@@ -155,11 +162,10 @@ def _numbers_of(value: object) -> set[str]:
     return shapes | {str(value)}
 
 
-def test_each_number_in_the_text_comes_from_the_data(case: Diagnosis, tmp_path: Path) -> None:
+def test_each_number_in_the_text_comes_from_the_data(written_case: Path) -> None:
     pictures = material.figure_data()
-    write_report(case, pictures, tmp_path, material.model())
-    _, page = read_page(tmp_path)
-    known = _numbers_of(json.loads((tmp_path / "report.json").read_text(encoding="utf-8")))
+    _, page = read_page(written_case)
+    known = _numbers_of(json.loads((written_case / "report.json").read_text(encoding="utf-8")))
     for t in pictures.traces:
         known |= _numbers_of(t.marked) | {t.name.split()[-1]}
     known |= _numbers_of(pictures.candidates)
