@@ -146,15 +146,16 @@ def test_every_form_of_one_cause_has_a_truth():
 
 @pytest.mark.parametrize("form_id", TRUTHS)
 def test_the_true_form_is_named_with_its_parameters(form_id):
+    """At most one of five curves has another name, and none of three maps, whose fits take long."""
     curve_id, truth, expected = TRUTHS[form_id]
     named, z = [], []
-    for seed in range(5):
+    for seed in range(5 if len(EFFECTS[curve_id].axes) == 1 else 3):
         form = identify_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves)
         named.append(form.id if form.is_within_band else "")
         if form.id == form_id:
             z += [(form.parameters[name].value - value) / form.parameters[name].std for name, value in expected.items()]
             assert all(e.low90 < e.value < e.high90 for e in form.parameters.values())
-    assert named.count(form_id) >= 4, named
+    assert named.count(form_id) >= 0.8 * len(named), named
     assert not z or (np.abs(z).max() < 4.0 and np.mean(np.abs(z) < 1.645) >= 0.6)
 
 
