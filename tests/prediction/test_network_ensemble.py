@@ -20,7 +20,7 @@ SMALL = EnsembleSettings(updates=150, check_every=50, n_networks=2, hidden_units
 
 @pytest.fixture(scope="module")
 def segments():
-    return segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 90.0, 11)])
+    return segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 70.0, 11)])
 
 
 @pytest.fixture(scope="module")
