@@ -210,7 +210,9 @@ def reference_rates(t, s, d, u, p, e):
             limit, shape = q["share"] * grip, 1.0 - q.get("roundness", 0.0)
             force = math.copysign(smaller_root(shape, abs(demand), limit), demand)
         m_ax = force + body_x - front_each * (z_front - transferred_load) * math.sin(d)
-        transferred_load = m_ax * height / (a + b)
+        before, transferred_load = transferred_load, m_ax * height / (a + b)
+        if math.isclose(before, transferred_load, rel_tol=1e-13):
+            break
     z_front, z_rear = z_front - transferred_load, z_rear + transferred_load
     f_front, f_rear = front_each * z_front, rear_each * z_rear
     if has("front_tyre_map"):
