@@ -158,6 +158,7 @@ def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
         ("motor_lag", "longitudinal_slip", 20.0, False),
         ("motor_lag", "longitudinal_slip", 40.0, True),
         ("longitudinal_slip", "motor_lag", 20.0, True),
+        ("longitudinal_slip", "motor_lag", 10.0, False),
     ],
 )
 def test_swap_with_an_effect_of_more_numbers_needs_a_higher_chi2(
