@@ -25,17 +25,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--hil", action="store", default=None, metavar="CAR.toml", help="also test this real car")
 
 
-gc.disable()  # until the tests are collected: imports make many objects and no garbage
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Search less often for garbage, and not among modules and tests."""
+    """Search for garbage once after the collection, and later not among the modules and tests that it made."""
+    gc.disable()
     try:
         return (yield)
     finally:
+        gc.collect()
         gc.freeze()
-        gc.set_threshold(50_000, 10, 10)
         gc.enable()
 
 

@@ -48,7 +48,7 @@ def _weave(t: NDArray, start: NDArray, angle: float, lag_s: float) -> NDArray:
 
 
 def trace(name: str = "recording 1") -> Trace:
-    return replace(_trace(), name=name)
+    return replace(_trace(), name=name, predicted=dict(_trace().predicted))
 
 
 @functools.cache

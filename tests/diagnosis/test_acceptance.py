@@ -7,6 +7,7 @@ import pytest
 
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
+from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.candidates import acceptance, accepted, is_accepted
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.prediction.windows import cut_windows, segments_of
@@ -57,19 +58,22 @@ def test_rejected_candidate_meets_no_set_of_conditions(
     ("best", "other", "confusable", "rise", "expected"),
     [
         pytest.param("longitudinal_slip", "motor_lag", True, 0.0, "motor_lag", id="equal loss"),
-        pytest.param("longitudinal_slip", "motor_lag", True, 0.1, "longitudinal_slip", id="higher loss in each block"),
+        pytest.param("longitudinal_slip", "motor_lag", True, 0.8, "motor_lag", id="slightly higher loss"),
+        pytest.param("longitudinal_slip", "motor_lag", True, 1.2, "longitudinal_slip", id="higher loss"),
         pytest.param("longitudinal_slip", "motor_lag", False, 0.0, "longitudinal_slip", id="not confusable"),
-        pytest.param("motor_lag", "longitudinal_slip", True, 0.0, "motor_lag", id="more parameters"),
-        pytest.param("motor_lag", "throttle_delay", True, 0.0, "motor_lag", id="as many parameters"),
+        pytest.param("motor_lag", "longitudinal_slip", True, -0.5, "motor_lag", id="more numbers"),
+        pytest.param("steering_rate_limit", "steering_lag", True, 0.0, "steering_rate_limit", id="as many numbers"),
     ],
 )
 def test_simpler_candidate_is_next_if_left_out_blocks_do_not_distinguish_it(
     problem: SearchProblem, strong: Candidate, best: str, other: str, confusable: bool, rise: float, expected: str
 ) -> None:
-    """The losses of both also differ by a random number in each window, whose sum is below its standard error."""
+    """The loss of the other one is higher by ``rise`` standard errors."""
     problem = replace(problem, confusable={best: (other,)} if confusable else {})
     random = np.random.default_rng(1).normal(0.0, 1.0, len(problem.windows))
-    losses = strong.left_out_loss, strong.left_out_loss + random - random.mean() + rise * len(problem.windows)
+    random -= random.mean()
+    _, error = clustered_gain(random, np.zeros_like(random), problem.windows)
+    losses = strong.left_out_loss, strong.left_out_loss + random + rise * error / len(random)
     candidates = tuple(replace(strong, effect=e, left_out_loss=x) for e, x in zip((best, other), losses, strict=True))
     model = Model((), strong.fit, Scale(np.array([1]), np.ones((1, 6))))
     chosen = accepted(problem, model, candidates, RunControl())

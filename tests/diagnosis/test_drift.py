@@ -52,12 +52,12 @@ def test_changed_drive_force_and_trim_are_found_with_their_sizes_and_an_unchange
 
 @pytest.mark.slow
 def test_fading_drive_force_has_its_change_along_the_recording(fitted):
-    (found,) = drift_of([fitted], [changing_drive(CONFIG, SECONDS, 4, lambda t: 1.0 - 0.006 * t, lambda t: 0.0)])
+    (found,) = drift_of([fitted], [changing_drive(CONFIG, SECONDS, 4, lambda t: 1.0 - 0.009 * t, lambda t: 0.0)])
     assert found.is_drift
     (change,) = found.changes
     assert change.quantity == "drive force"
-    assert change.first == pytest.approx(-0.006 * 0.125 * SECONDS, abs=0.04)
-    assert change.last == pytest.approx(-0.006 * 0.875 * SECONDS, abs=0.04)
+    assert change.first == pytest.approx(-0.009 * 0.125 * SECONDS, abs=0.04)
+    assert change.last == pytest.approx(-0.009 * 0.875 * SECONDS, abs=0.04)
 
 
 def test_physics_that_the_simulator_lacks_in_all_recordings_is_no_drift():

@@ -146,7 +146,7 @@ def test_every_form_of_one_cause_has_a_truth():
 
 @pytest.mark.parametrize("form_id", TRUTHS)
 def test_the_true_form_is_named_with_its_parameters(form_id):
-    """At most one of five curves has another name, and none of three maps, whose fits take long."""
+    """The form is named for four of five curves, and for all of three maps, whose fits take longer."""
     curve_id, truth, expected = TRUTHS[form_id]
     named, z = [], []
     for seed in range(5 if len(EFFECTS[curve_id].axes) == 1 else 3):

@@ -15,7 +15,7 @@ from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.selection import candidates, moves
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import refit, refit_candidate
+from carlab.diagnosis.selection.refit import refit, refit_candidate, refit_without_each
 from carlab.diagnosis.selection.screening import ScreeningResult
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
@@ -146,6 +146,7 @@ def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
         assert set(complete) == {c.effect for c in found}
     else:
         assert set(complete) == set(begun) == {c.effect for c in found}
+        assert all(c.is_tested for c in found)
     full = refit(problem, (LAG, "motor_lag"), found[0].fit, model.scale)
     assert found[0].gain == pytest.approx(model.fit.cost - full.fit.cost, rel=0.03)
 
@@ -155,8 +156,9 @@ def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
     [
         ("motor_lag", "throttle_delay", 20.0, True),
         ("motor_lag", "throttle_delay", 15.0, False),
-        ("motor_lag", "longitudinal_slip", 20.0, False),
-        ("motor_lag", "longitudinal_slip", 40.0, True),
+        ("motor_lag", "longitudinal_slip", 23.0, False),
+        ("motor_lag", "longitudinal_slip", 25.0, True),
+        ("steering_lag", "steering_rate_limit", 17.0, True),
         ("longitudinal_slip", "motor_lag", 20.0, True),
         ("longitudinal_slip", "motor_lag", 10.0, False),
     ],
@@ -164,7 +166,7 @@ def test_candidates_with_small_gains_are_finished_only_if_no_other_is_accepted(
 def test_swap_with_an_effect_of_more_numbers_needs_a_higher_chi2(
     monkeypatch: pytest.MonkeyPatch, name: str, other: str, chi2: float, replaced: bool
 ) -> None:
-    """Slipping wheels have one number more than a lag, and an infinite identity."""
+    """Slipping wheels have one number more than a lag."""
     problem, scale = short_problem()
     problem = replace(problem, confusable={name: (other,)})
     nothing = Model((), problem.fitter(scale).fit(CAR, ()), scale)
@@ -173,3 +175,47 @@ def test_swap_with_an_effect_of_more_numbers_needs_a_higher_chi2(
     monkeypatch.setattr(moves, "fit_with_scale", lambda problem, effects, *given: Model(effects, nothing.fit, scale))
     model = moves._swap(problem, Model((name,), nothing.fit, scale), {name: nothing}, RunControl())
     assert (model.effects if model is not None else (name,)) == ((other,) if replaced else (name,))
+
+
+@pytest.mark.parametrize("has_effect", [True, False])
+def test_candidates_wait_only_if_the_model_has_an_effect_and_they_are_not_confusable_with_the_best(
+    has_effect: bool,
+) -> None:
+    problem, scale = short_problem()
+    problem = replace(problem, confusable={"motor_lag": ("throttle_delay",)})
+    nothing = problem.fitter(scale).fit(CAR, ())
+    gains = {"motor_lag": 10.0, "drag_brake": 5.0, BRAKE: 4.9, "throttle_delay": 1.0, "wind": -1.0}
+    begun = [Candidate(name, nothing, gain) for name, gain in gains.items()]
+    model = Model((LAG,) if has_effect else (), nothing, scale)
+    first, waiting = candidates._first_and_waiting(problem, model, begun)
+    assert [c.effect for c in waiting] == ([BRAKE, "wind"] if has_effect else [])
+    assert first == [c for c in begun if c not in waiting]
+    worse = [replace(c, gain=c.gain - 20.0) for c in begun]
+    assert candidates._first_and_waiting(problem, model, worse) == (worse, [])
+
+
+def test_refit_for_a_comparison_does_not_replace_an_accurate_one() -> None:
+    problem, scale = short_problem()
+    model = refit(problem, (LAG, BRAKE), problem.fitter(scale).fit(CAR, ()), scale)
+    early = refit_without_each(problem, model, RunControl(), is_comparison=True)
+    accurate = refit_without_each(problem, model, RunControl())
+    assert len(problem.refits) == 5
+    assert accurate[LAG].fit.cost < early[LAG].fit.cost
+    again = refit_without_each(problem, model, RunControl(), is_comparison=True)
+    assert {name: m.fit.cost for name, m in again.items()} == {name: m.fit.cost for name, m in accurate.items()}
+    assert len(problem.refits) == 5
+
+
+def test_progress_of_a_step_does_not_go_back() -> None:
+    """All candidates are refitted, tested and refused, first those with large gains, then the others."""
+    true = replace(CAR, effects={LAG: {"time_constant": 0.05}, "motor_lag": {"time_constant": 0.15}})
+    windows = cut_windows(segments_of([drive(true, 10.0, 3)]), 0.8, 0.5)
+    refuse = replace(DEFAULT.selection, accept_chi2_min=1e9, steady_z_min=1e9, min_score_share=0.0)
+    names = ("motor_lag", "mocap_yaw_misalignment", "rolling_resistance")
+    problem = SearchProblem(CAR, windows, 3.0 * STD, STD, {}, names, replace(DEFAULT, selection=refuse))
+    model = refit(problem, (LAG,), problem.fitter(short_problem()[1]).fit(CAR, ()), short_problem()[1])
+    shares: list[float] = []
+    candidates.next_candidates(problem, model, RunControl(lambda activity, share: shares.append(share)))
+    assert len(shares) > 4
+    assert shares == sorted(shares)
+    assert 0.1 <= shares[0] < shares[-1] < 0.2

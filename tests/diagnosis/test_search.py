@@ -108,7 +108,7 @@ def test_negligible_effect_is_not_named(long_drag: Case, tmp_path: Path) -> None
 
 
 def test_result_is_the_same_with_two_processes(drag: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One process repeats no refit, although four stages remove each effect."""
+    """One process repeats no refit of the same accuracy, although four stages remove each effect."""
     fits: list[bytes] = []
 
     def counted(

@@ -39,7 +39,7 @@ class EventDrive:
 
 @functools.cache
 def event_drive(seed: int, kind: str = "", *, length_s: float = 60.0, period_s: float = 1 / 30) -> EventDrive:
-    """Drive a car with events every 4 to 8 s. Tests share the result, so they do not change it.
+    """Drive a car with events every 4 to 8 s. Tests share the result, whose arrays are read-only.
 
     Args:
         seed: of everything that is drawn.
@@ -68,6 +68,8 @@ def event_drive(seed: int, kind: str = "", *, length_s: float = 60.0, period_s: 
     recording = record(driven, world, Noise(nominal.position_std, nominal.yaw_std), rng)
     sent = recording.commands[:-1]
     episode = EpisodeData(recording.t_s, recording.measured, sent, sent, np.zeros(len(sent)))
+    for array in (episode.times_s, episode.states, episode.sent):
+        array.setflags(write=False)
     return EventDrive(episode, tuple(spans), _config(nominal))
 
 

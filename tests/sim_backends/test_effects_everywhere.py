@@ -87,7 +87,8 @@ def with_gradients(names, engine):
     values = {k: torch.full((4,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
     # Gradients of a long chain of operators take long: 6 s for 6 ticks.
     (start, commands), history = some(ticks=3 if engine == "operators" else 6), past()
-    commands[:, 1] = 0.0  # the kink of a dead band and a power
+    # Commands act 0.08 s late, so one of the history is at the kink of a dead band and a power too.
+    commands[:, 1] = history[:, -1] = 0.0
     leaves = [t.requires_grad_() for t in (start, commands, history)]
     options = {"t0_s": 2.0, "max_step_s": 0.02, "engine": engine}
     out = measured_rollout(config, start, commands, history=history, values=values, **options)

@@ -72,6 +72,15 @@ class Fit:
         return {f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)}
 
 
+class _Point(NamedTuple):
+    """Coordinates z (n,), whitened errors (S, U, 6), cost, and the damping of the step that ended here."""
+
+    z: FloatArray
+    white: FloatArray
+    cost: float
+    damping: float
+
+
 class Linearisation(NamedTuple):
     """Whitened errors (S, U, 6) and their Jacobian (n, S, U, 6)."""
 
@@ -198,9 +207,9 @@ class Fitter:
             free: n parameters.
             start: their initial coordinates (n,); zeros unless given.
             iterations: maximum number.
-            tolerance: the fit ends when an iteration lowers the cost by less than this share of it.
-            compared_cost: cost of a model that the fit is compared with. The fit also ends when an iteration lowers the
-                cost by less than ``compared_tolerance`` of the difference.
+            tolerance: the fit ends when an iteration without strong damping lowers the cost by less than this share.
+            compared_cost: cost of a model that the fit is only compared with. Then a fall by less than
+                ``compared_tolerance`` (of the settings) of the difference ends the fit too.
         """
         count = len(free)
         z = np.zeros(count) if start is None else np.array(start, dtype=np.float64)
@@ -212,34 +221,53 @@ class Fitter:
         z = z.clip(low, high)
         precision = self.precision(free)
         white = self.white(config, free, z[None])[0]
-        cost = float(self.huber(white).sum() + self.prior(free, z[None])[0])
-        damping = 1e-2
+        at = _Point(z, white, float(self.huber(white).sum() + self.prior(free, z[None])[0]), 1e-2)
         for _ in range(iterations):
-            normal, gradient = self._normal(self.jacobian(config, free, z, white), white)
-            normal, gradient = normal + precision, gradient + precision @ z
-            lowest, highest = np.maximum(low - z, -MAX_STEP), np.minimum(high - z, MAX_STEP)
-            improved = False
-            for _ in range(3):
-                dampings = damping * np.array([0.1, 1.0, 10.0, 100.0])
-                matrices = [normal + value * np.diag(np.diag(normal) + 1e-9) for value in dampings]
-                tried = z + np.array([bounded_step(matrix, gradient, lowest, highest) for matrix in matrices])
-                whites = self.white(config, free, tried)
-                costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
-                best = int(np.argmin(costs))
-                if costs[best] < cost:
-                    improved = True
-                    gain = cost - float(costs[best])
-                    z, white, cost = tried[best], whites[best], float(costs[best])
-                    damping = max(float(dampings[best]), 1e-6)
-                    break
-                damping *= 1e3
-            difference = 0.0 if compared_cost is None else abs(cost - compared_cost)
-            smallest = max(tolerance * cost, self.settings.compared_tolerance * difference)
-            if not improved or (gain < smallest and damping <= MAX_DAMPING_AT_END):
+            before = at.cost
+            normal, gradient = self._normal(self.jacobian(config, free, at.z, at.white), at.white)
+            normal, gradient = normal + precision, gradient + precision @ at.z
+            lower = self._lower_point(config, free, at, normal, gradient)
+            if lower is None:
                 break
-        fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
-        loss = self.huber(white).sum(axis=(1, 2))
-        return Fit(fitted, free, z, cost, np.asarray(loss))
+            at = lower
+            difference = 0.0 if compared_cost is None else abs(at.cost - compared_cost)
+            smallest = max(tolerance * at.cost, self.settings.compared_tolerance * difference)
+            if before - at.cost < smallest and at.damping <= MAX_DAMPING_AT_END:
+                break
+        fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, at.z, strict=True)})
+        return Fit(fitted, free, at.z, at.cost, np.asarray(self.huber(at.white).sum(axis=(1, 2))))
+
+    def _lower_point(
+        self,
+        config: SimulatorConfig,
+        free: Sequence[FitParameter],
+        at: _Point,
+        normal: FloatArray,
+        gradient: FloatArray,
+    ) -> _Point | None:
+        """The lowest of the points after steps with several dampings; None if none is lower.
+
+        Args:
+            config: simulator.
+            free: n parameters.
+            at: point of the fit.
+            normal: Gauss-Newton matrix (n, n) of the cost there.
+            gradient: gradient (n,) of the cost there.
+        """
+        low, high = coordinate_bounds(free)
+        lowest, highest = np.maximum(low - at.z, -MAX_STEP), np.minimum(high - at.z, MAX_STEP)
+        damping = at.damping
+        for _ in range(3):
+            dampings = damping * np.array([0.1, 1.0, 10.0, 100.0])
+            matrices = [normal + value * np.diag(np.diag(normal) + 1e-9) for value in dampings]
+            tried = at.z + np.array([bounded_step(matrix, gradient, lowest, highest) for matrix in matrices])
+            whites = self.white(config, free, tried)
+            costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
+            best = int(np.argmin(costs))
+            if costs[best] < at.cost:
+                return _Point(tried[best], whites[best], float(costs[best]), max(float(dampings[best]), 1e-6))
+            damping *= 1e3
+        return None
 
     def with_covariance(
         self, fit: Fit, linearisation: Linearisation | None = None, held: NDArray[np.bool_] | None = None

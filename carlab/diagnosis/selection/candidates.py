@@ -10,61 +10,85 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
-from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import begin_refit, finish_refit
 from carlab.diagnosis.selection.screening import ScreeningResult, screen_candidates
 
 log = logging.getLogger(__name__)
 
-Part = TypeVar("Part", ScreeningResult, Candidate)
+Begun = TypeVar("Begun", ScreeningResult, Candidate)
 
 
 def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -> tuple[Candidate, ...]:
     """Refitted candidates, sorted by gain; those tested on left-out blocks come first.
 
-    After the first effect, candidates with a small gain after the first iterations are finished and tested only if none
-    of the others is accepted.
+    If the model has an effect, candidates with a small gain after the first iteration wait, except those that are
+    confusable with the best one. They are fitted further and tested only if none of the others is accepted. All
+    candidates for the first effect are compared, because the report shows them.
     """
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
     screened = screen_candidates(problem, model, names, control)
     fitter = problem.fitter(model.scale)
     linearisation = fitter.linearised(model.fit)
     chosen = _to_refit(problem, screened, fitter.with_covariance(model.fit, linearisation).design_effect)
-    begun = _mapped(begin_refit, problem, model, chosen, control)
+    begun = _fitted(begin_refit, problem, model, chosen, _step(problem, model, control, 0.0, 0.3))
     if not begun:
         return ()
-    settings = problem.settings.selection
-    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_left_out_error, linearisation)
-    min_gain = settings.min_first_gain_share * max(c.gain for c in begun) if model.effects else -math.inf
+    max_error = problem.settings.selection.max_left_out_error
+    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), max_error, linearisation)
     found: tuple[Candidate, ...] = ()
-    for part in ([c for c in begun if c.gain >= min_gain], [c for c in begun if c.gain < min_gain]):
-        refitted = sorted(_mapped(finish_refit, problem, model, part, control), key=lambda c: -c.gain)
-        found = _tested(problem, model, (*found, *refitted), reference, control)
+    groups = _first_and_waiting(problem, model, begun)
+    for group, (first, middle, last) in zip(groups, ((0.3, 0.6, 0.7), (0.7, 0.9, 1.0)), strict=True):
+        refitted = _fitted(finish_refit, problem, model, group, _step(problem, model, control, first, middle))
+        found = _tested(problem, model, (*found, *refitted), reference, _step(problem, model, control, middle, last))
         if any(is_accepted(problem, c) for c in found):
             break
     return found
 
 
-def _mapped(
-    refit: Callable[[SearchProblem, Model, Part], Candidate],
+def _first_and_waiting(
+    problem: SearchProblem, model: Model, begun: Sequence[Candidate]
+) -> tuple[list[Candidate], list[Candidate]]:
+    """The candidates that are fitted further at once, and those that wait."""
+    best = max(begun, key=lambda c: c.gain)
+    if not model.effects or best.gain <= 0.0:
+        return list(begun), []
+    min_gain = problem.settings.selection.min_first_gain_share * best.gain
+    confusable = problem.confusable.get(best.effect, ())
+    first = [c for c in begun if c.gain >= min_gain or c.effect in confusable]
+    return first, [c for c in begun if c not in first]
+
+
+def _step(problem: SearchProblem, model: Model, control: RunControl, first: float, last: float) -> RunControl:
+    """The control of a part of the step that adds an effect, from ``first`` to ``last`` as shares of the step."""
+    done, steps = len(model.effects), problem.settings.selection.max_effects
+
+    def progress(activity: str, share: float) -> None:
+        control.progress(activity, (done + first + (last - first) * share) / steps)
+
+    return replace(control, progress=progress)
+
+
+def _fitted(
+    refit: Callable[[SearchProblem, Model, Begun], Candidate],
     problem: SearchProblem,
     model: Model,
-    parts: Sequence[Part],
+    items: Sequence[Begun],
     control: RunControl,
 ) -> list[Candidate]:
     """Fits of candidates by the workers; fewer if the search is to end."""
-    done, steps = len(model.effects), problem.settings.selection.max_effects
     fitted = control.workers.map(
         refit,
-        [(problem.without_refits(), model, part) for part in parts],
+        [(problem.without_refits(), model, item) for item in items],
         stop=control.ends_search,
-        started=lambda k: control.progress(f"refitting with {parts[k].effect}", (done + 0.5 * k / len(parts)) / steps),
+        started=lambda k: control.progress(f"refitting with {items[k].effect}", k / len(items)),
     )
     return [candidate for candidate in fitted if candidate is not None]
 
@@ -94,12 +118,11 @@ def _tested(
     by_gain = sorted(refitted, key=lambda c: -c.gain)
     min_gain = settings.min_gain_share * by_gain[0].gain if by_gain else 0.0
     new = [c for k, c in enumerate(by_gain) if (c.gain >= min_gain or k < 2) and not c.is_tested]
-    share = (len(model.effects) + 0.7) / settings.max_effects
     tested = control.workers.map(
         with_left_out_gain,
         [(problem.without_refits(), fitter, candidate, reference) for candidate in new],
         stop=control.ends_search,
-        started=lambda k: control.progress(f"cross-validating {new[k].effect}", share),
+        started=lambda k: control.progress(f"cross-validating {new[k].effect}", k / len(new)),
     )
     for c in tested:
         if c is not None:
@@ -155,8 +178,8 @@ def accepted(
 ) -> tuple[Candidate, ...]:
     """The candidates that are accepted, the next effect first; records the decision about each tested one.
 
-    The best is next, unless an accepted candidate that is confusable with it is simpler and not distinguished from it:
-    the rule of one standard error (Breiman et al. 1984).
+    An accepted candidate that is confusable with the best one is next if it has fewer numbers and a loss on left-out
+    blocks that is higher by less than one standard error (Breiman et al. 1984).
     """
     tested = [c for c in candidates if c.is_tested]
     for c in tested:
@@ -167,15 +190,15 @@ def accepted(
         return ()
     best = chosen[0]
     simpler = [c for c in chosen if c is best or _is_simpler(problem, c, best)]
-    simplest = min(simpler, key=lambda c: problem.required_chi2(c.effect))
+    simplest = min(simpler, key=lambda c: len(numbers_of(c.effect)))
     return (simplest, *(c for c in chosen if c is not simplest))
 
 
 def _is_simpler(problem: SearchProblem, candidate: Candidate, best: Candidate) -> bool:
-    """Whether a confusable candidate has fewer parameters, and a loss on left-out blocks that is not distinguished."""
+    """Whether a confusable candidate has fewer numbers, and no significantly higher loss on left-out blocks."""
     if candidate.effect not in problem.confusable.get(best.effect, ()):
         return False
-    if problem.required_chi2(candidate.effect) >= problem.required_chi2(best.effect):
+    if len(numbers_of(candidate.effect)) >= len(numbers_of(best.effect)):
         return False
     lead, error = clustered_gain(candidate.left_out_loss, best.left_out_loss, problem.windows)
     return lead < problem.settings.selection.simpler_z_max * error

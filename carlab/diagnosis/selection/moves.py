@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.gains import design_effect_of
-from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import fit_with_scale, refit_candidate, refit_without_each
 from carlab.diagnosis.selection.screening import Screen
 
@@ -70,7 +70,7 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     ]
     swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
     for (name, _), swap in zip(pairs, swaps, strict=True):
-        if swap is not None and swap[1] > settings.keep_chi2_min + _more_numbers_chi2(problem, swap[0].effect, name):
+        if swap is not None and swap[1] > settings.keep_chi2_min + _additional_chi2(problem, swap[0].effect, name):
             candidate, chi2 = swap
             log.info("%s replaces %s (chi2 %.1f)", candidate.effect, name, chi2)
             fit, effects = candidate.fit, (*reduced[name].effects, candidate.effect)
@@ -78,9 +78,10 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     return None
 
 
-def _more_numbers_chi2(problem: SearchProblem, other: str, name: str) -> float:
-    """Additional chi2 of an effect that replaces one with fewer numbers."""
-    return max(problem.required_chi2(other) - problem.required_chi2(name), 0.0)
+def _additional_chi2(problem: SearchProblem, new: str, old: str) -> float:
+    """Additional minimum chi2 of a swap to an effect with more numbers."""
+    more = len(numbers_of(new)) - len(numbers_of(old))
+    return problem.settings.selection.accept_chi2_per_number * max(more, 0)
 
 
 def _fitted_swap(

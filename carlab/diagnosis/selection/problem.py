@@ -23,7 +23,7 @@ from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CATALOGUE, EFFECTS
+from sim_backends.effects import CATALOGUE, EFFECTS, EffectParameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class SearchProblem:
     def required_chi2(self, effect: str) -> float:
         """Minimum chi2 of an effect; it grows with the number of parameters and for an infinite identity value."""
         settings = self.settings.selection
-        numbers = [p for p in EFFECTS[effect].parameters if not p.choices]
+        numbers = numbers_of(effect)
         infinite = any(p.identity is not None and math.isinf(p.identity) for p in numbers)
         return settings.accept_chi2_min + settings.accept_chi2_per_number * (len(numbers) - 1 + infinite)
 
@@ -196,6 +196,11 @@ class RunControl:
     omit: Callable[[str], None] = lambda stage: None
     ends_search: Callable[[], bool] = lambda: False
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
+
+
+def numbers_of(effect: str) -> list[EffectParameter]:
+    """Parameters of an effect that are numbers, not choices."""
+    return [p for p in EFFECTS[effect].parameters if not p.choices]
 
 
 def is_applicable(config: SimulatorConfig, effect: str) -> bool:

@@ -37,13 +37,20 @@ def refit_without_each(
 ) -> dict[str, Model]:
     """For each effect of a model (or each of ``names``), the model without it, refitted.
 
-    A refit for comparison only ends where the difference of the costs is known well enough (``Fitter.fit``).
+    With ``is_comparison``, each fit ends early (``compared_cost`` of ``Fitter.fit``), unless it was fitted before.
     """
     removed = model.effects if names is None else names
     others = {name: tuple(e for e in model.effects if e != name) for name in removed}
     starts = {name: _start(problem, effects, model.fit) for name, effects in others.items()}
     cost = model.fit.cost if is_comparison else None
-    keys = {name: _key(problem, effects, starts[name], model.scale, cost) for name, effects in others.items()}
+    keys = {name: _key(problem, effects, starts[name], model.scale) for name, effects in others.items()}
+    if is_comparison:
+        keys = {
+            name: key
+            if key in problem.refits
+            else _key(problem, others[name], starts[name], model.scale, model.fit.cost)
+            for name, key in keys.items()
+        }
     new = [name for name in removed if keys[name] not in problem.refits]
     fitted = control.workers.map(
         _fit_from,
@@ -104,7 +111,7 @@ def begin_refit(problem: SearchProblem, model: Model, screened: ScreeningResult)
     """The first iterations of ``refit_candidate``."""
     fitter = problem.fitter(model.scale)
     config, free, start = _candidate_start(problem, model, screened)
-    fit = fitter.fit(config, free, start, iterations=problem.settings.selection.first_iterations)
+    fit = fitter.fit(config, free, start, iterations=problem.settings.selection.first_gain_iterations)
     return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
 
 

@@ -46,8 +46,8 @@ class IdentificationSettings:
     loss_steps: int = 6
     """Steps of a window whose errors enter the loss."""
     compared_tolerance: float = 0.02
-    """A fit that is compared with another model ends when an iteration lowers its cost by less than this share of the
-    difference of their costs."""
+    """A fit that is only compared with another model ends when an iteration lowers its cost by less than this share of
+    the difference of their costs, which is then known to a few per cent (docs/decisions/0045)."""
     max_fold_step: float = 4.0
     """Maximum step of a coordinate when a fold is removed from a fit."""
     fold_step_shares: tuple[float, ...] = (1.0, 0.5, 0.2)
