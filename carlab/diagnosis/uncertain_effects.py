@@ -1,6 +1,7 @@
-"""Withdrawal of effects that a joint fit of parameters and initial states does not confirm.
+"""Withdrawal of effects whose numbers do not differ from those without the effect.
 
-The search has windows with estimated initial states, and an effect can follow from the errors of these estimates.
+The search has windows with estimated initial states, and an effect can follow from the errors of these estimates; a
+joint fit of parameters and initial states does not confirm it. A limit that may also be infinite is no finding either.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ import math
 import numpy as np
 
 from carlab.diagnosis.decisions import Condition, Decision
-from carlab.diagnosis.evidence import ScoredSearch
-from carlab.diagnosis.selection.problem import RunControl
+from carlab.diagnosis.evidence import ScoredSearch, estimate
+from carlab.diagnosis.selection.problem import RunControl, numbers_of
 from carlab.diagnosis.selection.search import restrict
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import EFFECTS, EffectParameter
 
 log = logging.getLogger(__name__)
 
@@ -27,26 +28,58 @@ MIN_OFFSET = 1e-9
 def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> ScoredSearch:
     """The search without effects whose numbers do not differ from those of the car file, or else from their identity.
 
-    Unchanged without a joint fit.
-
     Effects are removed one by one, the most uncertain first, because two that resemble each other are uncertain only
     together.
     """
-    limit = scored.problem.settings.evidence.identity_distance_min
-    while scored.is_joint and scored.found.effects:
-        distances = {name: identity_distance(scored, name) for name in scored.found.effects}
-        weakest = min(distances, key=lambda name: distances[name])
-        stands = distances[weakest] > limit
-        for name in distances if stands else (weakest,):
-            condition = Condition("evidence.identity_distance_min", distances[name], limit)
-            control.record(Decision("stand", name, ((condition,),), stands, len(distances)))
+    while scored.found.effects:
+        conditions = {name: _conditions(scored, name) for name in scored.found.effects}
+        ratios = {
+            name: min((c.statistic / c.threshold for c in own), default=math.inf) for name, own in conditions.items()
+        }
+        weakest = min(ratios, key=lambda name: ratios[name])
+        stands = ratios[weakest] > 1.0
+        for name in conditions if stands else (weakest,):
+            if conditions[name]:
+                control.record(Decision("stand", name, (conditions[name],), stands, len(conditions)))
         if stands:
             break
-        log.info("%s: withdrawn, because the joint fit does not distinguish it from its identity", weakest)
-        remaining = tuple(name for name in distances if name != weakest)
+        log.info("%s: withdrawn, because the fit does not distinguish it from its identity", weakest)
+        remaining = tuple(name for name in conditions if name != weakest)
         found = restrict(scored.problem, scored.found, remaining, control)
         scored = ScoredSearch.of(scored.problem, found, scored.held_out)
     return scored
+
+
+def _conditions(scored: ScoredSearch, effect: str) -> tuple[Condition, ...]:
+    """Conditions under which an effect stands: one after a joint fit, one for an effect with an infinite identity."""
+    settings = scored.problem.settings.evidence
+    found = []
+    if scored.is_joint:
+        distance = identity_distance(scored, effect)
+        found.append(Condition("evidence.identity_distance_min", distance, settings.identity_distance_min))
+    if effect not in scored.problem.nominal.effects and any(_is_unbounded(p) for p in numbers_of(effect)):
+        found.append(Condition("evidence.range_ratio_min", range_ratio(scored, effect), settings.range_ratio_min))
+    return tuple(found)
+
+
+def range_ratio(scored: ScoredSearch, effect: str) -> float:
+    """The end of the range over the upper end of the 90 % interval, for the numbers with an infinite identity.
+
+    The largest ratio of the effect; infinite if the interval of another number does not contain its identity.
+    """
+    ends = {f.name: f.high for f in scored.fit.free}
+    ratios = []
+    for p in numbers_of(effect):
+        found = estimate(scored, name := f"effects.{effect}.{p.name}")
+        if _is_unbounded(p):
+            ratios.append(ends[name] / found.high90)
+        elif p.identity is not None and not found.low90 <= p.identity <= found.high90:
+            return math.inf
+    return max(ratios)
+
+
+def _is_unbounded(parameter: EffectParameter) -> bool:
+    return parameter.identity is not None and math.isinf(parameter.identity)
 
 
 def identity_distance(scored: ScoredSearch, effect: str) -> float:

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import huber as huber_loss
 
 from carlab.diagnosis.decisions import Decision
-from carlab.diagnosis.evidence import ScoredSearch
+from carlab.diagnosis.evidence import ScoredSearch, estimate
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
@@ -15,7 +15,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
-from carlab.diagnosis.uncertain_effects import identity_distance, without_uncertain_effects
+from carlab.diagnosis.uncertain_effects import identity_distance, range_ratio, without_uncertain_effects
 from carlab.diagnosis.weak_effects import without_harmful_effects
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
@@ -142,3 +142,56 @@ def test_remaining_effects_have_the_fit_that_was_judged(scored: ScoredSearch) ->
     without = refit(problem, (), confirmed.best, scale).fit
     scores = [held_out.score(held_out.final_error(fit.config)) for fit in (without, confirmed.best)]
     assert decisions[-1].alternatives[0][0].statistic == pytest.approx(scores[0] / scores[1] - 1.0, rel=1e-9)
+
+
+SATURATION = "motor_saturation"
+
+
+@pytest.fixture(scope="module")
+def saturated() -> ScoredSearch:
+    """A car whose drive force is limited to 4 N, fitted with this limit; the model errs by more than the noise."""
+    true = replace(CAR, effects={SATURATION: {"force": 4.0, "roundness": 0.0}, LAG: {"time_constant": 0.05}})
+    windows, held_out = (cut_windows(segments_of([drive(true, 30.0, seed)]), 0.8, 0.5) for seed in (3, 4))
+    problem = SearchProblem(CAR, windows, STD, STD, {})
+    scale = Scale(np.array([8, 16, 24]), np.tile(3.0 * STD, (3, 1)))
+    nothing = problem.fitter(scale).fit(CAR, ())
+    base, best = (refit(problem, effects, nothing, scale).fit for effects in ((), (SATURATION,)))
+    found = SearchResult(base, best, (SATURATION,), {SATURATION: 100.0}, {}, ((SATURATION, best),), (), scale)
+    return ScoredSearch.of(problem, found, HeldOut(held_out, STD, Noise(STD, STD)))
+
+
+def test_limit_whose_interval_does_not_reach_the_end_of_its_range_stands(saturated: ScoredSearch) -> None:
+    assert not saturated.is_joint
+    decisions: list[Decision] = []
+    assert without_uncertain_effects(saturated, RunControl(record=decisions.append)).found.effects == (SATURATION,)
+    ((condition,),) = decisions[0].alternatives
+    force = estimate(saturated, f"effects.{SATURATION}.force")
+    assert force.low90 < 4.0 < force.high90
+    end = next(f.high for f in saturated.fit.free if f.name == f"effects.{SATURATION}.force")
+    assert condition.statistic == pytest.approx(end / force.high90)
+    assert condition.statistic > 10.0
+
+
+def test_limit_that_may_be_infinite_is_withdrawn(saturated: ScoredSearch) -> None:
+    """The interval of the force is as wide as its range."""
+    value = float(next(z for f, z in zip(saturated.fit.free, saturated.fit.z, strict=True) if SATURATION in f.name))
+    uncertain = with_values(saturated, SATURATION, value, 1e4)
+    decisions: list[Decision] = []
+    assert without_uncertain_effects(uncertain, RunControl(record=decisions.append)).found.effects == ()
+    assert [(d.effect, d.passed) for d in decisions] == [(SATURATION, False)]
+    assert decisions[0].alternatives[0][0].statistic == 1.0
+
+
+@pytest.mark.parametrize(("inertia_std", "expected"), [(1e-3, np.inf), (1e3, 1.0)])
+def test_limit_stands_if_another_number_differs_from_its_identity(
+    saturated: ScoredSearch, inertia_std: float, expected: float
+) -> None:
+    """Slipping wheels with an inertia need no finite stiffness."""
+    values = {"inertia": 0.01, "stiffness": 1e3}
+    free = effect_parameters("longitudinal_slip", CAR)
+    names = [f.name.rpartition(".")[2] for f in free]
+    covariance = np.diag([inertia_std**2 if name == "inertia" else 1e2 for name in names])
+    z = np.array([f.coordinate(values[name]) for f, name in zip(free, names, strict=True)])
+    config = replace(CAR, effects={"longitudinal_slip": values})
+    fit = replace(saturated.fit, config=config, free=free, z=z, covariance=covariance)
+    assert range_ratio(replace(saturated, fit=fit), "longitudinal_slip") == expected

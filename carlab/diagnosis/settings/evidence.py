@@ -37,6 +37,9 @@ class EvidenceSettings:
     """An effect is withdrawn if its numbers in a joint fit differ from their identities, or from those of the car file,
     by less than this many standard deviations (Mahalanobis distance, without ``joint_interval_factor``). An infinite
     identity has no distance."""
+    range_ratio_min: float = 1.0
+    """An effect with an infinite identity (a limit) is withdrawn if the end of its number's range, divided by the upper
+    end of the 90 % interval, is not above this: then the limit may as well be absent."""
     unexplained_score_min: float = 1.2
     """Refit score (noise floors) above which unnamed terms count as missing physics."""
     unexplained_score_min_without_term: float = 1.8
