@@ -62,8 +62,11 @@ def _first_and_waiting(
         return list(begun), []
     min_gain = problem.settings.selection.min_first_gain_share * best.gain
     confusable = problem.confusable.get(best.effect, ())
-    first = [c for c in begun if c.gain >= min_gain or c.effect in confusable]
-    return first, [c for c in begun if c not in first]
+    waits = [c.gain < min_gain and c.effect not in confusable for c in begun]
+    return (
+        [c for c, waiting in zip(begun, waits, strict=True) if not waiting],
+        [c for c, waiting in zip(begun, waits, strict=True) if waiting],
+    )
 
 
 def _step(problem: SearchProblem, model: Model, control: RunControl, first: float, last: float) -> RunControl:
