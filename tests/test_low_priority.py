@@ -39,7 +39,12 @@ def test_signal_ends_the_command_and_its_children(number: signal.Signals) -> Non
         "import signal, subprocess, sys; [signal.signal(n, signal.SIG_DFL) for n in (1, 2, 15)]\n"
         f"child = subprocess.Popen([sys.executable, '-c', {child!r}]); print(child.pid, flush=True); child.wait()"
     )
-    with subprocess.Popen([*COMMAND, code], stdout=subprocess.PIPE, text=True) as process:
+
+    def heed() -> None:
+        """A script that starts the tests in the background makes them ignore SIGINT."""
+        signal.signal(number, signal.SIG_DFL)
+
+    with subprocess.Popen([*COMMAND, code], stdout=subprocess.PIPE, text=True, preexec_fn=heed) as process:
         assert process.stdout is not None
         pid = int(process.stdout.readline())
         process.send_signal(number)
