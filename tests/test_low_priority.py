@@ -40,11 +40,11 @@ def test_signal_ends_the_command_and_its_children(number: signal.Signals) -> Non
         f"child = subprocess.Popen([sys.executable, '-c', {child!r}]); print(child.pid, flush=True); child.wait()"
     )
 
-    def heed() -> None:
+    def reset_signal() -> None:
         """A script that starts the tests in the background makes them ignore SIGINT."""
         signal.signal(number, signal.SIG_DFL)
 
-    with subprocess.Popen([*COMMAND, code], stdout=subprocess.PIPE, text=True, preexec_fn=heed) as process:
+    with subprocess.Popen([*COMMAND, code], stdout=subprocess.PIPE, text=True, preexec_fn=reset_signal) as process:
         assert process.stdout is not None
         pid = int(process.stdout.readline())
         process.send_signal(number)

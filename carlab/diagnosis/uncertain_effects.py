@@ -13,9 +13,9 @@ import numpy as np
 
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.evidence import ScoredSearch, estimate
-from carlab.diagnosis.selection.problem import RunControl, numbers_of
+from carlab.diagnosis.selection.problem import RunControl, has_infinite_identity, numbers_of
 from carlab.diagnosis.selection.search import restrict
-from sim_backends.effects import EFFECTS, EffectParameter
+from sim_backends.effects import EFFECTS
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ def _conditions(scored: ScoredSearch, effect: str) -> tuple[Condition, ...]:
     if scored.is_joint:
         distance = identity_distance(scored, effect)
         found.append(Condition("evidence.identity_distance_min", distance, settings.identity_distance_min))
-    if effect not in scored.problem.nominal.effects and any(_is_unbounded(p) for p in numbers_of(effect)):
+    if effect not in scored.problem.nominal.effects and any(map(has_infinite_identity, numbers_of(effect))):
         found.append(Condition("evidence.range_ratio_min", range_ratio(scored, effect), settings.range_ratio_min))
     return tuple(found)
 
@@ -71,15 +71,11 @@ def range_ratio(scored: ScoredSearch, effect: str) -> float:
     ratios = []
     for p in numbers_of(effect):
         found = estimate(scored, name := f"effects.{effect}.{p.name}")
-        if _is_unbounded(p):
+        if has_infinite_identity(p):
             ratios.append(ends[name] / found.high90)
         elif p.identity is not None and not found.low90 <= p.identity <= found.high90:
             return math.inf
     return max(ratios)
-
-
-def _is_unbounded(parameter: EffectParameter) -> bool:
-    return parameter.identity is not None and math.isinf(parameter.identity)
 
 
 def identity_distance(scored: ScoredSearch, effect: str) -> float:

@@ -64,9 +64,11 @@ def test_candidate_starts_at_the_values_of_a_fit_whose_effects_have_another_orde
     begun: dict[str, float] = {}
     fit_from = Fitter.fit
 
-    def watched(fitter: Fitter, config: SimulatorConfig, free: tuple[FitParameter, ...], start: FloatArray) -> Fit:
+    def watched(
+        fitter: Fitter, config: SimulatorConfig, free: tuple[FitParameter, ...], start: FloatArray, **options: Any
+    ) -> Fit:
         begun.update(zip((f.name for f in free), start.tolist(), strict=True))
-        return fit_from(fitter, config, free, start)
+        return fit_from(fitter, config, free, start, **options)
 
     monkeypatch.setattr(Fitter, "fit", watched)
     refit_candidate(problem, sorted_model, ScreeningResult("rolling_resistance", 1.0, np.array([[0.3]])))

@@ -99,7 +99,7 @@ class SearchProblem:
         """Minimum chi2 of an effect; it grows with the number of parameters and for an infinite identity value."""
         settings = self.settings.selection
         numbers = numbers_of(effect)
-        infinite = any(p.identity is not None and math.isinf(p.identity) for p in numbers)
+        infinite = any(map(has_infinite_identity, numbers))
         return settings.accept_chi2_min + settings.accept_chi2_per_number * (len(numbers) - 1 + infinite)
 
 
@@ -201,6 +201,11 @@ class RunControl:
 def numbers_of(effect: str) -> list[EffectParameter]:
     """Parameters of an effect that are numbers, not choices."""
     return [p for p in EFFECTS[effect].parameters if not p.choices]
+
+
+def has_infinite_identity(parameter: EffectParameter) -> bool:
+    """Whether the effect is absent at an infinite value, as a limit is."""
+    return parameter.identity is not None and math.isinf(parameter.identity)
 
 
 def is_applicable(config: SimulatorConfig, effect: str) -> bool:

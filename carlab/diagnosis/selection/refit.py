@@ -45,12 +45,7 @@ def refit_without_each(
     cost = model.fit.cost if is_comparison else None
     keys = {name: _key(problem, effects, starts[name], model.scale) for name, effects in others.items()}
     if is_comparison:
-        keys = {
-            name: key
-            if key in problem.refits
-            else _key(problem, others[name], starts[name], model.scale, model.fit.cost)
-            for name, key in keys.items()
-        }
+        keys = {name: key if key in problem.refits else (key, cost) for name, key in keys.items()}
     new = [name for name in removed if keys[name] not in problem.refits]
     fitted = control.workers.map(
         _fit_from,
@@ -67,19 +62,10 @@ def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> Fl
     return np.array([known.get(f.name, 0.0) for f in problem.free_parameters(effects)])
 
 
-def _key(
-    problem: SearchProblem,
-    effects: tuple[str, ...],
-    start: FloatArray,
-    scale: Scale,
-    compared_cost: float | None = None,
-) -> Hashable:
-    """What a refit depends on: starting values by name, the scale and the cost that it is compared with.
-
-    The order of effects changes rounding only.
-    """
+def _key(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
+    """Starting values by name, and the scale: what a refit depends on. The order of effects changes rounding only."""
     names = (f.name for f in problem.free_parameters(effects))
-    return frozenset(zip(names, start.tolist(), strict=True)), scale.as_bytes(), compared_cost
+    return frozenset(zip(names, start.tolist(), strict=True)), scale.as_bytes()
 
 
 def _in_order(problem: SearchProblem, model: Model, effects: tuple[str, ...]) -> Model:
@@ -99,20 +85,29 @@ def _fit_from(
     return Model(effects, problem.fitter(scale).fit(config, free, start, compared_cost=compared_cost), scale)
 
 
-def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
-    """Fit the candidate together with ``model``, from the initial points of its screening."""
+def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult, iterations: int = 12) -> Candidate:
+    """Fit the candidate together with ``model``, from the initial points of its screening.
+
+    The initial points are compared after a few iterations on part of the windows. Those of an effect with one number
+    differ in size alone, and fits from them end at the same minimum, so the best of them stands for all.
+    """
     fitter = problem.fitter(model.scale)
-    config, free, start = _candidate_start(problem, model, screened)
-    fit = fitter.fit(config, free, start)
+    effects = (*model.effects, screened.effect)
+    config, free = problem.config_with(effects), problem.free_parameters(effects)
+    before = _start(problem, model.effects, model.fit)
+    starts = [np.concatenate([before, s]) for s in _distinct_starts(free[len(before) :], screened.starts)]
+    if len(starts) > 1:
+        settings = problem.settings.selection
+        few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
+        tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
+        starts = [min(tries, key=lambda f: f.cost).z]
+    fit = fitter.fit(config, free, starts[0], iterations=iterations)
     return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
 
 
 def begin_refit(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
     """The first iterations of ``refit_candidate``."""
-    fitter = problem.fitter(model.scale)
-    config, free, start = _candidate_start(problem, model, screened)
-    fit = fitter.fit(config, free, start, iterations=problem.settings.selection.first_gain_iterations)
-    return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
+    return refit_candidate(problem, model, screened, problem.settings.selection.first_gain_iterations)
 
 
 def finish_refit(problem: SearchProblem, model: Model, begun: Candidate) -> Candidate:
@@ -121,26 +116,6 @@ def finish_refit(problem: SearchProblem, model: Model, begun: Candidate) -> Cand
     cost = model.fit.cost
     fit = problem.fitter(model.scale).fit(config, begun.fit.free, begun.fit.z, compared_cost=cost)
     return Candidate(begun.effect, fit, cost - fit.cost)
-
-
-def _candidate_start(
-    problem: SearchProblem, model: Model, screened: ScreeningResult
-) -> tuple[SimulatorConfig, tuple[FitParameter, ...], FloatArray]:
-    """The simulator with a candidate, its n parameters and their initial coordinates (n,).
-
-    The initial points are compared after a few iterations on part of the windows. Those of an effect with one number
-    differ in size alone, and fits from them end at the same minimum, so the best of them stands for all.
-    """
-    effects = (*model.effects, screened.effect)
-    config, free = problem.config_with(effects), problem.free_parameters(effects)
-    before = _start(problem, model.effects, model.fit)
-    starts = [np.concatenate([before, s]) for s in _distinct_starts(free[len(before) :], screened.starts)]
-    if len(starts) == 1:
-        return config, free, starts[0]
-    settings = problem.settings.selection
-    few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
-    tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
-    return config, free, min(tries, key=lambda f: f.cost).z
 
 
 def _distinct_starts(own: Sequence[FitParameter], starts: FloatArray) -> FloatArray:
