@@ -310,6 +310,8 @@ class SafeCar:
             kinds["stale_pose"] = f"The pose is {age_s * 1e3:.0f} ms old: neutral until a fresh pose arrives."
         elif not observation.velocity_valid:
             kinds["unknown_speed"] = "Too few poses to estimate the speed: neutral until more arrive."
+        elif self.car.pose_problems():  # A wrong axis shows itself only once the car has turned.
+            self._end(EndReason.TRACKING_LOST, "Poses arrive, but they may be wrong.", now_s)
         if kinds:
             target = NEUTRAL
             self.state = SafetyState.PAUSED

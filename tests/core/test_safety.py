@@ -160,6 +160,17 @@ def test_a_state_that_is_not_a_number_ends_the_episode(
     assert (car.log, car.stops) == ([], [False])
 
 
+def test_suspected_error_of_motion_capture_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    safe, car, _ = gate()
+    safe.arm()
+    assert not safe.command(Action(0.1, 0.1), seen(10.0), PERIOD_S).is_neutral
+    monkeypatch.setattr(car, "pose_problems", lambda: ("the body is tilted.",))
+    with pytest.raises(SafetyStop, match=r"may be wrong\. Motion capture reports: the body is tilted\.") as caught:
+        safe.command(Action(0.1, 0.1), seen(10.0), PERIOD_S)
+    assert caught.value.reason is EndReason.TRACKING_LOST
+    assert (len(car.log), car.stops) == (1, [False])
+
+
 @pytest.mark.parametrize(
     ("t_capture_s", "t_receive_s", "why"),
     [
