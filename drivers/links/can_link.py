@@ -202,7 +202,5 @@ class CanLink:
         if self.interface == "socketcan":
             found = sorted(path.name for path in Path("/sys/class/net").glob("*can*"))
             there = f"the available CAN interfaces are {', '.join(found)}" if found else "there is no CAN interface"
-            return (
-                f"{cause}; {there}. Bring it up with {self._command_up} and set 'channel' in [hardware.actuator]."
-            )
+            return f"{cause}; {there}. Bring it up with {self._command_up} and set 'channel' in [hardware.actuator]."
         return f"{cause}. Check 'interface' and 'channel' in [hardware.actuator], and the driver of the adapter."
