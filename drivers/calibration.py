@@ -53,7 +53,8 @@ class ActuatorCalibration:
     ``throttle_mode`` "current" drives with ``max_current_a`` at full throttle, "duty" with ``max_duty``; a negative
     throttle drives backwards. ``throttle_sign`` is -1 if the motor is wired backwards. ``throttle_dead_band`` is the
     share of full throttle that the car needs before it moves; it is added to every throttle that is not zero.
-    Neutral is zero current, or ``neutral_brake_a`` of brake current (at most ``max_brake_a``), and the centred servo.
+    Neutral (steering 0 and throttle 0) is zero current, or ``neutral_brake_a`` of brake current (at most
+    ``max_brake_a``), and the centred servo. Throttle 0 with another steering does not brake.
     """
 
     servo_centre: float = 0.5
@@ -113,6 +114,8 @@ class ActuatorCalibration:
         """
         if not action.is_finite:
             raise ActionOutOfRangeError(f"{action} is not a number; the policy that made it has diverged.")
+        if action.is_neutral and self.neutral_brake_a > 0.0:
+            return self.neutral
         steering = min(1.0, max(-1.0, action.steering))
         throttle = min(1.0, max(-1.0, action.throttle))
         span = self.servo_range_left if steering >= 0.0 else self.servo_range_right

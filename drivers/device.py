@@ -62,7 +62,6 @@ class DeviceCounters:
 
     crc_errors: int = 0
     garbage_bytes: int = 0
-    partial_timeouts: int = 0
     link_opens: int = 0
 
 

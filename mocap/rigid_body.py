@@ -189,7 +189,7 @@ class RigidBodyPoseSource(Resource):
         if _share(self._recent_tilted) > RECENT_SHARE:
             return [
                 f"the body '{self._body_name}' is tilted by more than {math.degrees(TILT_LIMIT_RAD):.0f} degrees: "
-                f"{remedy}, or the body was not level when it was created in Motive."
+                f"{remedy}, the body was not level when it was created in Motive, or the car has rolled over."
             ]
         _, y_span_m, z_span_m = (high - low for low, high in zip(self._low_m, self._high_m, strict=True))
         if self._tracked and z_span_m > HEIGHT_LIMIT_M and y_span_m < 0.1 * z_span_m:

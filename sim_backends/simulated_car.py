@@ -9,6 +9,7 @@ from carlab.core.angles import wrap
 from carlab.core.car import Car
 from carlab.core.clock import Clock, SimulatedClock
 from carlab.core.errors import ActuatorFaultError, CarlabError, ConfigError, NotArmedError, NotOpenError, PoseLostError
+from carlab.core.planar import arc, to_world
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Health, Observation, PoseSample, Reality
 from carlab.core.state_estimator import StateEstimator
 from sim_backends.array_ops import FLOATS
@@ -48,15 +49,10 @@ class _Approach:
         self._state, self._t_s = state, t_s
 
     def measured_pose(self, t_s: float) -> Pose:
-        s, dt = self._state, t_s - self._t_s
-        turn = s.yaw_rate_radps * dt
-        # Chord of the arc: sin(turn)/turn along, (1 - cos(turn))/turn across.
-        along, across = (math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn) if abs(turn) > 1e-9 else (1.0, 0.0)
-        forward = dt * (along * s.vx_mps - across * s.vy_mps)
-        left = dt * (across * s.vx_mps + along * s.vy_mps)
-        sin, cos = math.sin(s.yaw_rad), math.cos(s.yaw_rad)
-        x, y = s.x_m + cos * forward - sin * left, s.y_m + sin * forward + cos * left
-        seen = self._measurement.observe((x, y, wrap(s.yaw_rad + turn), s.vx_mps, s.vy_mps, s.yaw_rate_radps))
+        x, y, yaw, vx, vy, yaw_rate = self._state.to_array()
+        ahead, left, turn = arc(vx, vy, yaw_rate, t_s - self._t_s)
+        dx, dy = to_world(ahead, left, yaw)
+        seen = self._measurement.observe(tuple(map(float, (x + dx, y + dy, wrap(yaw + turn), vx, vy, yaw_rate))))
         return Pose(seen[0], seen[1], wrap(seen[2]))
 
 

@@ -105,11 +105,12 @@ def check(
             latency = measure_pose_latency(opened, seconds=seconds, period_s=choice.control_period_s)
             if wheels and isinstance(opened, EmulatedCar):
                 latency = measure_latency(opened, period_s=choice.control_period_s)
-            hardware = opened.hardware if isinstance(opened, EmulatedCar) else opened
-            if isinstance(hardware, HardwareCar):
-                with contextlib.suppress(ActuatorFaultError):  # ``health`` has the fault
-                    hardware.measure_motor_timeout()
         except (NotReadyError, TimeoutError) as error:
             problems.append(str(error))
+        hardware = opened.hardware if isinstance(opened, EmulatedCar) else opened
+        if isinstance(hardware, HardwareCar):
+            with contextlib.suppress(ActuatorFaultError):  # ``health`` has the fault
+                hardware.measure_motor_timeout()
         health = opened.health()
-    return CarCheck(health, latency, (*problems, *health.problems))
+    problems += [problem for problem in health.problems if not any(problem in known for known in problems)]
+    return CarCheck(health, latency, tuple(problems))

@@ -11,14 +11,13 @@ class WireFaults:
     """Faults of the wire between host and firmware. Shares count frames in both directions.
 
     ``drops_replies`` drops all replies of the firmware, ``stops_reading`` leaves the bytes of the host unread until
-    its buffer is full, ``drop_share`` loses frames, ``corrupt_share`` flips one bit, ``reply_delay_s`` delays replies.
+    its buffer is full, ``drop_share`` loses frames, ``corrupt_share`` flips one bit.
     """
 
     drops_replies: bool = False
     stops_reading: bool = False
     drop_share: float = 0.0
     corrupt_share: float = 0.0
-    reply_delay_s: float = 0.0
     seed: int = 0
     dropped: int = 0
     corrupted: int = 0

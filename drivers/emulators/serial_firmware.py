@@ -194,7 +194,7 @@ class SerialFirmware(Resource):
             self._send(self.faults.transmit(encode_frame(reply)), t_s)
 
     def _send(self, data: bytes, t_s: float) -> None:
-        self._t_line_out_s = max(t_s + self.faults.reply_delay_s, self._t_line_out_s) + self._wire_s(len(data))
+        self._t_line_out_s = max(t_s, self._t_line_out_s) + self._wire_s(len(data))
         self._outgoing.append((self._t_line_out_s, data))
 
     def _write(self, data: bytes) -> None:

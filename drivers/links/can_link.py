@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import ipaddress
 import select
 from pathlib import Path
@@ -184,18 +185,22 @@ class CanLink:
             self._bus.flush_tx_buffer()
 
     def _failed(self, error: object) -> ActuatorFaultError:
+        remedy = "check wiring, termination and power"
+        codes = (getattr(error, "errno", None), getattr(error, "error_code", None))
+        if self.interface == "socketcan" and errno.ENETDOWN in codes:  # a socket can be bound to it while it is down
+            remedy = f"bring it up with {self._command_up}"
         return ActuatorFaultError(
-            f"CAN bus {self.interface} {self.channel} failed ({error}); check wiring, termination and power, "
-            "then reset the fault."
+            f"CAN bus {self.interface} {self.channel} failed ({error}); {remedy}, then reset the fault."
         )
+
+    @property
+    def _command_up(self) -> str:
+        return f"'ip link set {self.channel} up type can bitrate {self.bitrate} restart-ms 100'"
 
     def _reason(self, error: BaseException) -> str:
         cause = error.__cause__ or error
         if self.interface == "socketcan":
             found = sorted(path.name for path in Path("/sys/class/net").glob("*can*"))
             there = f"the available CAN interfaces are {', '.join(found)}" if found else "there is no CAN interface"
-            return (
-                f"{cause}; {there}. Bring it up with 'ip link set {self.channel} up type can bitrate {self.bitrate} "
-                "restart-ms 100' and set 'channel' in [hardware.actuator]."
-            )
+            return f"{cause}; {there}. Bring it up with {self._command_up} and set 'channel' in [hardware.actuator]."
         return f"{cause}. Check 'interface' and 'channel' in [hardware.actuator], and the driver of the adapter."

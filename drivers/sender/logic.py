@@ -15,6 +15,13 @@ NEUTRAL_FRAMES = 3
 NEUTRAL_SPAN_S = 0.12
 """The controller must receive neutral over at least 60 ms. It may receive the first frame late: twice that."""
 
+MAX_LAST_BRAKING_S = 1.5
+"""Longest time for which neutral brakes a rolling car before the sender ends [s]: at 3 m/s2 it stops from 4.5 m/s.
+
+It is shorter than the time for which the main process waits for the end of the sender."""
+REST_ERPM = 200.0
+"""Largest motor speed of a car at rest [electrical rev/min], the default limit for arming."""
+
 
 class SenderState(enum.IntEnum):
     """State of the sender. It sends commands in ARMED only, otherwise neutral."""
@@ -300,9 +307,16 @@ class SenderLogic:
         span_s = now_s - self._t_first_neutral_s
         self._is_neutral_settled = self._neutral_run >= NEUTRAL_FRAMES and span_s >= NEUTRAL_SPAN_S
         if self._is_neutral_settled and self._is_shutting_down:
-            self.is_finished = True
+            self.is_finished = span_s >= MAX_LAST_BRAKING_S or not self._is_braking(now_s)
         elif self._is_neutral_settled and self.state == SenderState.STOPPING:
             self.state = SenderState.CONNECTED
+
+    def _is_braking(self, now_s: float) -> bool:
+        """Whether neutral brakes a car that rolls: it would coast once no command is sent any more."""
+        erpm = None if self.values is None else self.values.erpm
+        is_rolling = erpm is not None and abs(erpm) > REST_ERPM
+        is_fresh = self.telemetry_age_s(now_s) <= self.config.telemetry_stale_s
+        return self.neutral.motor_kind == MotorKind.BRAKE and is_rolling and is_fresh
 
     def _watch_telemetry(self, now_s: float) -> None:
         if self.state in (SenderState.DISCONNECTED, SenderState.FAULT) or self._is_shutting_down:

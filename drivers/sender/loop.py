@@ -72,7 +72,6 @@ class SenderLoop:
         self._t_written_s = float("nan")
         self._late_s = np.zeros(LATENESS_WINDOW)
         self._late_ms = (0.0, 0.0, 0.0)
-        self._ticks = 0
         self._deadlines = 0
         self._skipped = 0
         self._needs_version = True
@@ -154,7 +153,6 @@ class SenderLoop:
             self.logic.main_lost()
 
     def _tick(self, now_s: float) -> None:
-        self._ticks += 1
         if self._is_wake_open and not self._is_main_alive():
             self._is_wake_open = False
             self.logic.main_lost()
@@ -296,14 +294,12 @@ class SenderLoop:
             late_p50_ms=late[0],
             late_p99_ms=late[1],
             late_max_ms=late[2],
-            ticks=self._ticks,
             skipped_ticks=self._skipped,
             frames=logic.frames,
             neutral_frames=logic.neutral_frames,
             watchdog_trips=logic.watchdog_trips,
             crc_errors=counters.crc_errors,
             garbage_bytes=counters.garbage_bytes,
-            partial_timeouts=counters.partial_timeouts,
             link_opens=counters.link_opens,
             hardware=version.hardware[:60] if version else "",
             fault=logic.fault[:600],

@@ -34,7 +34,6 @@ class Slot:
     def __init__(self, descriptor: int, capacity: int) -> None:
         self.descriptor = descriptor
         self.capacity = capacity
-        self.torn_reads = 0
         self._stride = _HEAD.size + capacity + _CRC.size
         self._memory: mmap.mmap | None = mmap.mmap(descriptor, 2 * self._stride)
         self._sequence = max(self._valid_sequences(), default=0)
@@ -98,7 +97,6 @@ class Slot:
             return None
         end = _HEAD.size + length
         if length > self.capacity or zlib.crc32(record[:end]) != _CRC.unpack_from(record, end)[0]:
-            self.torn_reads += 1
             return None
         return sequence, record[_HEAD.size : end]
 

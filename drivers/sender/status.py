@@ -47,14 +47,12 @@ class SenderStatus:
     late_p50_ms: float = 0.0
     late_p99_ms: float = 0.0
     late_max_ms: float = 0.0
-    ticks: int = 0
     skipped_ticks: int = 0
     frames: int = 0
     neutral_frames: int = 0
     watchdog_trips: int = 0
     crc_errors: int = 0
     garbage_bytes: int = 0
-    partial_timeouts: int = 0
     link_opens: int = 0
     hardware: str = ""
     fault: str = ""

@@ -215,24 +215,13 @@ def decode_status(frame: CanFrame) -> MotorValues | None:
 
     Raises ProtocolError for a status of the wrong length.
     """
-    signals = decode_status_signals(frame)
-    if signals is None:
-        return None
-    return MotorValues(**{name: value for name, value in signals.items() if name in _VALUE_NAMES})  # type: ignore[arg-type]
-
-
-def decode_status_signals(frame: CanFrame) -> dict[str, float] | None:
-    """Decode all signals of a STATUS_1 ... 6 broadcast by their names in the DBC; None for other frames.
-
-    Raises ProtocolError for a status of the wrong length.
-    """
     if packet_of(frame) not in STATUS_PACKETS:
         return None
     message = database().get_message_by_frame_id(frame.identifier)
     if len(frame.data) < message.length:
         raise ProtocolError(f"{message.name} has {len(frame.data)} bytes, not {message.length}.")
     decoded = cast("dict[str, Any]", message.decode(frame.data[: message.length], decode_choices=False))
-    return {name: float(value) for name, value in decoded.items()}
+    return MotorValues(**{name: float(value) for name, value in decoded.items() if name in _VALUE_NAMES})  # type: ignore[arg-type]
 
 
 def encode_status(packet: Packet, controller_id: int, values: MotorValues) -> CanFrame:

@@ -46,7 +46,6 @@ class VescFrameDecoder:
     frames: int = 0
     crc_errors: int = 0
     garbage_bytes: int = 0
-    timeouts: int = 0
     _buffer: bytearray = field(default_factory=bytearray)
     _arrivals: deque[tuple[int, float]] = field(default_factory=deque)
     """For each chunk with bytes in the buffer: number of bytes received with it, and time [s]."""
@@ -55,7 +54,6 @@ class VescFrameDecoder:
     def feed(self, data: bytes, t_s: float) -> list[bytes]:
         """Add bytes that arrived at ``t_s`` (any monotonic clock; may be empty) and return complete payloads."""
         payloads: list[bytes] = []
-        self.timeouts += self._is_overdue(t_s)
         while self._is_overdue(t_s):
             self._drop_byte()
             self._scan(payloads)

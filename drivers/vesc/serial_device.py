@@ -36,7 +36,6 @@ class VescSerialDevice:
         return DeviceCounters(
             decoder.crc_errors,
             decoder.garbage_bytes + self._replies.garbage_bytes,
-            decoder.timeouts,
             self.link.statistics.opens,
         )
 

@@ -55,7 +55,6 @@ class EmulatedScene:
 
     bodies: Sequence[EmulatedBody]
     up_axis: Literal["y", "z"] = "y"
-    extra_markers_m: tuple[Vector3, ...] = ()
     _last: dict[int, RigidBodySample] = field(default_factory=dict)
 
     def descriptions(self) -> tuple[Description, ...]:
@@ -93,9 +92,7 @@ class EmulatedScene:
                 labelled.append(LabelledMarker(body.id << 16 | index + 1, *place, 0.02, params, 3e-4))
             sets.append(MarkerSet(body.name, tuple(markers)))
         sets.append(MarkerSet("all", tuple(p for s in sets for p in s.positions_m)))
-        extra = tuple(self._vector(m) for m in self.extra_markers_m)
-        labelled += [LabelledMarker(50001 + i, *place, 0.02, 0x12, 3e-4) for i, place in enumerate(extra)]
-        return Frame(number, tuple(sets), extra, tuple(rigid_bodies), labelled_markers=tuple(labelled))
+        return Frame(number, tuple(sets), rigid_bodies=tuple(rigid_bodies), labelled_markers=tuple(labelled))
 
     def _vector(self, v: Vector3) -> Vector3:
         return y_up_vector(v) if self.up_axis == "y" else v

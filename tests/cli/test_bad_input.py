@@ -134,6 +134,19 @@ def test_wrong_up_axis_is_reported_and_prevents_driving(carlab: Carlab, tmp_path
         assert 'up_axis = "y" may be right' in text
 
 
+def test_wrong_up_axis_ends_a_drive_that_begins_at_yaw_0(carlab: Carlab, tmp_path: Path, world: World) -> None:
+    with world:
+        world.answer({"do": "place", "state": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]})
+        addresses = world.addresses
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"], 'body = "car"\nup_axis = "z"')
+        options = ["--no-place", "--no-rerun", "--no-picture", "--policy", "slow_circle"]
+        code, text = carlab("drive", "--car", path, *options, "--out", tmp_path / "runs")
+        assert code == 4
+        assert 'up_axis = "y" may be right' in text
+        yaw_rad = world.answer({"do": "state"})["state"][2]
+        assert 0.6 < yaw_rad < 1.4, "the drive ended soon after the turn by 40 degrees"
+
+
 @pytest.mark.parametrize(
     ("table", "parts"),
     [

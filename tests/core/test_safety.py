@@ -160,6 +160,28 @@ def test_a_state_that_is_not_a_number_ends_the_episode(
     assert (car.log, car.stops) == ([], [False])
 
 
+def test_suspected_error_of_motion_capture_gives_neutral_and_ends_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    safe, car, events = gate()
+    safe.arm()
+    assert not safe.command(Action(0.1, 0.1), seen(10.0), PERIOD_S).is_neutral
+    for problems, is_neutral in (((), False), (("the body is tilted.",), True), ((), False)):
+        monkeypatch.setattr(car, "pose_problems", lambda problems=problems: problems)
+        car.clock.sleep_until(car.clock.now_s() + 0.6)
+        assert safe.command(Action(0.1, 0.1), seen(car.clock.now_s()), PERIOD_S).is_neutral is is_neutral
+    monkeypatch.setattr(car, "pose_problems", lambda: ("the body is tilted.",))
+    for _ in range(2):
+        car.clock.sleep_until(car.clock.now_s() + 0.4)
+        assert safe.command(Action(0.1, 0.1), seen(car.clock.now_s()), PERIOD_S).is_neutral
+    car.clock.sleep_until(car.clock.now_s() + 0.2)
+    with pytest.raises(SafetyStop, match=r"may be wrong\. Motion capture reports: the body is tilted\.") as caught:
+        safe.command(Action(0.1, 0.1), seen(car.clock.now_s()), PERIOD_S)
+    assert caught.value.reason is EndReason.TRACKING_LOST
+    assert car.stops == [False]
+    assert [event.text for event in events] == ["Neutral while motion capture reports: the body is tilted."] * 2 + [
+        f"{EndReason.TRACKING_LOST.value} {caught.value.detail}"
+    ]
+
+
 @pytest.mark.parametrize(
     ("t_capture_s", "t_receive_s", "why"),
     [

@@ -78,6 +78,20 @@ def test_commands_arrive_as_returned_and_stop_ends_in_neutral(
     assert actuator.command(NEUTRAL) == NEUTRAL
 
 
+def test_neutral_of_an_armed_car_brakes(serial_firmware: SerialFirmware) -> None:
+    """The safety gate and a released dead-man control give neutral without disarming the car."""
+    log = serial_firmware.log
+    with Actuator(config_for(serial_firmware), replace(CALIBRATION, neutral_brake_a=2.5)) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in log.motor()))
+        t_released_s = time.monotonic()
+        assert actuator.command(NEUTRAL) == NEUTRAL
+        until(lambda: actuator.status().sent_number == 2)
+        until(lambda: len(log.motor(t_released_s)) > 10)
+        assert {(e.name, e.value) for e in log.motor(t_released_s)[5:]} == {("brake", 2.5)}
+
+
 def test_command_is_written_before_the_next_deadline(serial_firmware: SerialFirmware) -> None:
     """At 10 Hz the next deadline is 50 ms away on average; a new command wakes the sender before it."""
     with Actuator(config_for(serial_firmware, rate_hz=10.0, telemetry_rate_hz=10.0), CALIBRATION) as actuator:

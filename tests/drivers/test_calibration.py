@@ -51,6 +51,9 @@ def test_modes_signs_and_dead_band_equal_a_hand_calculation() -> None:
     assert duty.neutral == DeviceCommand(MotorKind.CURRENT, 0, 500)
     braking = ActuatorCalibration(neutral_brake_a=2.5)
     assert braking.neutral == DeviceCommand(MotorKind.BRAKE, 2500, 500)
+    assert braking.to_device(NEUTRAL) == braking.neutral
+    assert braking.from_device(braking.neutral) == NEUTRAL
+    assert braking.to_device(Action(0.5, 0.0)) == DeviceCommand(MotorKind.CURRENT, 0, 650)
 
 
 @given(calibrations(), UNIT, UNIT)

@@ -78,6 +78,24 @@ def test_bus_errors_raise_faults_and_flush_the_queue(failure: Exception) -> None
         link.read()
 
 
+@pytest.mark.parametrize(
+    "failure",
+    [
+        can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN),
+        can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN),
+    ],
+)
+def test_interface_that_is_down_names_the_command_that_brings_it_up(failure: Exception) -> None:
+    """Linux binds a socket to a CAN interface that is down (net/can/raw.c); the first frame shows it."""
+    link = BrokenLink("socketcan", f"test-{uuid.uuid4()}", 250_000)
+    link.open()
+    link.bus.failure = failure
+    for use in (link.read, lambda: link.write(vesc_can_codec.set_current(23, 1.0))):
+        with pytest.raises(ActuatorFaultError, match=rf"'ip link set {link.channel} up type can bitrate 250000 "):
+            use()
+    link.close()
+
+
 def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
     link = BrokenLink("virtual", f"test-{uuid.uuid4()}")
     link.open()

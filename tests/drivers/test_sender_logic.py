@@ -208,6 +208,40 @@ def test_shutdown_sends_three_neutrals_over_sixty_milliseconds(cause: str) -> No
     assert times[-1] - times[0] >= 0.06 - 1e-9
 
 
+@pytest.mark.parametrize("cause", ["request", "main lost"])
+@pytest.mark.parametrize(
+    ("brake_a", "speed_mps", "is_answering", "until_s"),
+    [
+        (4.0, 3.0, True, 1.0 - 200.0 / 9000.0),  # (3 m/s - that at 200 eRPM) / 3 m/s2
+        (4.0, -3.0, True, 1.0 - 200.0 / 9000.0),
+        (4.0, 9.0, True, 1.5),
+        (4.0, 0.05, True, 0.12),
+        (0.0, 3.0, True, 0.12),
+        (4.0, 3.0, False, 0.25),
+    ],
+)
+def test_shutdown_brakes_until_the_car_is_at_rest(
+    cause: str, brake_a: float, speed_mps: float, is_answering: bool, until_s: float
+) -> None:
+    """A car that brakes at 3 m/s2, with 3000 eRPM for 1 m/s; without telemetry its speed is unknown after 0.25 s."""
+    bench = Bench(calibration=replace(CALIBRATION, neutral_brake_a=brake_a)).connect()
+    bench.is_answering = False
+    bench.logic.telemetry(bench.now_s, replace(HEALTHY, erpm=3000.0 * speed_mps))
+    start_s = bench.now_s
+    if cause == "request":
+        bench.send_request(Request.SHUT_DOWN)
+    else:
+        bench.logic.main_lost()
+    times = []
+    while not bench.logic.is_finished:
+        assert bench.tick() == bench.logic.neutral
+        times.append(bench.now_s)
+        slower_mps = max(abs(speed_mps) - 3.0 * (bench.now_s - start_s), 0.0)
+        if is_answering:
+            bench.logic.telemetry(bench.now_s, replace(HEALTHY, erpm=math.copysign(3000.0 * slower_mps, speed_mps)))
+    assert times[-1] - start_s == pytest.approx(until_s, abs=0.021)
+
+
 def test_unplanned_stop_latches_and_planned_stop_keeps_a_fault() -> None:
     bench = armed()
     bench.send_request(Request.STOP_AND_LATCH)
