@@ -32,6 +32,7 @@ from typing import Any, Self
 
 from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.json_files import read_json
 from carlab.core.version import VERSION
 from carlab.recording.atomic_files import write_json
 from carlab.recording.sink import writing
@@ -171,6 +172,15 @@ class RunDirectory:
         handler.setLevel(logging.INFO)
         handler.setFormatter(JsonFormatter())
         return handler
+
+    @property
+    def result_rows(self) -> list[dict[str, Any]]:
+        """The episodes in result.json; empty if the file is missing or cannot be read."""
+        try:
+            rows = read_json(self.path / RESULT_FILE)["episodes"]
+            return [row for row in rows if isinstance(row, dict) and type(row.get("episode")) is int]
+        except (OSError, ValueError, KeyError, TypeError):
+            return []
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write result.json. Raises DataError if that fails."""
