@@ -87,11 +87,19 @@ class RunDirectory:
 
     @classmethod
     def open_existing(cls, path: Path | str) -> Self:
-        """Resume a run. Raises DataError if ``path`` is no run's folder or cannot be written."""
+        """Resume a run.
+
+        Raises:
+            DataError: ``path`` is no run's folder, contains a symbolic link, or cannot be written.
+        """
         path = Path(path)
         if not (path / "environment.json").is_file():
             raise DataError(
                 f"{path} is not a run's folder (it has no environment.json); name one such as runs/2026-..."
+            )
+        if link := next((entry for entry in path.rglob("*") if entry.is_symlink()), None):
+            raise DataError(
+                f"{link} is a symbolic link, through which a run could write outside its folder; replace it by a copy."
             )
         run = cls(path)
         with writing(path):
