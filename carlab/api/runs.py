@@ -198,16 +198,9 @@ def collecting(hooks: RunHooks, run: RunDirectory, results: list[EpisodeResult])
 
 
 def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
-    """Write result.json: end reason and figures of each episode, after the earlier episodes of a resumed run."""
-    from carlab.recording.run_folder import RESULT_FILE
-
-    path = run.path / RESULT_FILE
-    try:
-        before = [row for row in read_json(path)["episodes"] if isinstance(row, dict)]
-    except (OSError, ValueError, KeyError, TypeError):
-        before = []
+    """Write result.json: end reason and figures of each episode, also of the earlier episodes of a resumed run."""
     now = {result.episode for result in results}
-    episodes = [e for e in before if e.get("episode") not in now] + [
+    episodes = [row for row in run.result_rows if row["episode"] not in now] + [
         {
             "episode": result.episode,
             "ticks": result.data.ticks,
@@ -218,7 +211,8 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
         }
         for result in results
     ]
-    run.write_result({"end_reason": results[-1].reason.name, "episodes": episodes})
+    episodes.sort(key=lambda row: int(row["episode"]))
+    run.write_result({"end_reason": episodes[-1].get("end_reason"), "episodes": episodes})
 
 
 def figure_names(results: Sequence[EpisodeResult]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +19,8 @@ from learning.devices import device_name
 
 
 def command() -> str:
-    """The current command line."""
-    return " ".join(["carlab", *sys.argv[1:]])
+    """The current command line, quoted for a shell."""
+    return shlex.join(["carlab", *sys.argv[1:]])
 
 
 def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[str]) -> StudyJob[Score]:

@@ -195,7 +195,6 @@ class ParkingTask(Task):
     parked_position_m: float = 0.2
     parked_yaw_rad: float = 0.35
     parked_speed_mps: float = 0.3
-    stop_when_parked: bool = False
     history_length: int = 3
     max_ticks: int = 100
     tick_weight: float = 1.0
@@ -237,11 +236,6 @@ class ParkingTask(Task):
             & (xp.abs(yaw_error) < self.parked_yaw_rad)
             & (speed < self.parked_speed_mps)
         )
-
-    def terminated(self, next_features: Any) -> Any:
-        """Terminate when parked, only if ``stop_when_parked``; the paper drives all ticks."""
-        parked = self.success(next_features)
-        return parked if self.stop_when_parked else parked & False
 
     def summary(self, times_s: FloatArray, states: FloatArray) -> dict[str, float]:
         """Final distance [m], yaw error [rad] and speed [m/s], and 1.0 for parked; arguments as of ``Task``."""

@@ -32,6 +32,7 @@ from typing import Any, Self
 
 from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.json_files import read_json
 from carlab.core.version import VERSION
 from carlab.recording.atomic_files import write_json
 from carlab.recording.sink import writing
@@ -86,11 +87,19 @@ class RunDirectory:
 
     @classmethod
     def open_existing(cls, path: Path | str) -> Self:
-        """Resume a run. Raises DataError if ``path`` is no run's folder or cannot be written."""
+        """Resume a run.
+
+        Raises:
+            DataError: ``path`` is no run's folder, contains a symbolic link, or cannot be written.
+        """
         path = Path(path)
         if not (path / "environment.json").is_file():
             raise DataError(
                 f"{path} is not a run's folder (it has no environment.json); name one such as runs/2026-..."
+            )
+        if link := next((entry for entry in path.rglob("*") if entry.is_symlink()), None):
+            raise DataError(
+                f"{link} is a symbolic link, through which a run could write outside its folder; replace it by a copy."
             )
         run = cls(path)
         with writing(path):
@@ -171,6 +180,15 @@ class RunDirectory:
         handler.setLevel(logging.INFO)
         handler.setFormatter(JsonFormatter())
         return handler
+
+    @property
+    def result_rows(self) -> list[dict[str, Any]]:
+        """The episodes in result.json; empty if the file is missing or cannot be read."""
+        try:
+            rows = read_json(self.path / RESULT_FILE)["episodes"]
+            return [row for row in rows if isinstance(row, dict) and type(row.get("episode")) is int]
+        except (OSError, ValueError, KeyError, TypeError):
+            return []
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write result.json. Raises DataError if that fails."""

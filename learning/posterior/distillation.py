@@ -251,44 +251,27 @@ def _rate(step: int, settings: DistillationSettings) -> float:
 
 
 def measurement_points(
-    model: DomainModel | None,
-    inputs: Tensor,
-    normaliser: Normaliser,
-    generator: torch.Generator,
-    count: int = MAX_DOMAIN_POINTS,
-    domain: Tensor | None = None,
+    model: DomainModel, inputs: Tensor, normaliser: Normaliser, generator: torch.Generator, count: int
 ) -> Tensor:
     """Raw inputs (count, D) at which particles are fitted to a posterior.
 
     From ``MIN_ROWS_FOR_NEIGHBOURS`` rows on, half are neighbours of rows; the others are drawn from the simulator's
-    domain, or from ``domain`` without a simulator.
+    domain.
 
     Args:
-        model: the simulator.
+        model: the simulator; a posterior without a simulator has only its domain.
         inputs: raw inputs of the rows (n, D).
         normaliser: its units.
         generator: of the draws.
         count: number of inputs.
-        domain: raw inputs (M, D).
-
-    Raises:
-        DataError: neither rows nor a domain are given.
     """
-    if model is None and domain is None and not len(inputs):
-        raise DataError("There is neither data nor a domain to learn in; name a car file as the prior.")
-    rows_only = model is None and domain is None
-    neighbours = count if rows_only else count // 2 if len(inputs) >= MIN_ROWS_FOR_NEIGHBOURS else 0
-    parts = []
-    if neighbours:
-        rows = inputs[torch.randint(len(inputs), (neighbours,), generator=generator).to(inputs.device)]
-        distance = MAX_NEIGHBOUR_DISTANCE * torch.rand((neighbours, 1), generator=generator)
-        offset = distance * torch.randn(rows.shape, generator=generator)
-        parts.append(rows + offset.to(rows) * normaliser.input_std)
-    if model is not None:
-        parts.append(model.inputs(count - neighbours, generator).to(inputs))
-    elif domain is not None:
-        parts.append(domain[torch.randint(len(domain), (count - neighbours,), generator=generator).to(domain.device)])
-    return torch.cat(parts)
+    if len(inputs) < MIN_ROWS_FOR_NEIGHBOURS:
+        return model.inputs(count, generator).to(inputs)
+    rows = inputs[torch.randint(len(inputs), (count // 2,), generator=generator).to(inputs.device)]
+    distance = MAX_NEIGHBOUR_DISTANCE * torch.rand((len(rows), 1), generator=generator)
+    offset = distance * torch.randn(rows.shape, generator=generator)
+    neighbours = rows + offset.to(rows) * normaliser.input_std
+    return torch.cat([neighbours, model.inputs(count - len(rows), generator).to(inputs)])
 
 
 def _noise(

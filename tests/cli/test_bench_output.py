@@ -6,7 +6,9 @@ import errno
 import json
 import math
 import os
+import shlex
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ import pytest
 import torch
 
 from carlab.cli import run
+from carlab.cli.bench_output import command
 from carlab.core.errors import DataError
 from carlab.recording.atomic_files import write_json
 from carlab.studies.regression.methods import METHODS
@@ -40,6 +43,12 @@ def read_strict_json(path: Path) -> dict[str, Any]:
 
 def replace_sysid(monkeypatch: pytest.MonkeyPatch, method: Callable[[Any], Any]) -> None:
     monkeypatch.setitem(METHODS, "SysID", method)
+
+
+def test_command_of_a_study_names_the_same_files_in_a_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["bench", "speed", "--out", "my figures/speed.json"]
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/carlab", *words])
+    assert shlex.split(command()) == ["carlab", *words]
 
 
 def test_failed_fit_is_reported_and_the_study_continues(

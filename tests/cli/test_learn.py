@@ -279,6 +279,29 @@ def test_resuming_a_complete_run_changes_no_file(carlab: Carlab, learned: tuple[
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"} == before
 
 
+@pytest.mark.parametrize("killed_before", ["row", "report", "result"])
+def test_run_killed_after_a_recording_writes_its_report_when_it_is_resumed(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, killed_before: str
+) -> None:
+    folder = tmp_path / learned[2].name
+    shutil.copytree(learned[2], folder)
+    complete = json.loads((folder / "result.json").read_text())
+    curve = json.loads((folder / "learn.json").read_text())
+    (folder / "result.json").write_text(json.dumps({**complete, "episodes": complete["episodes"][:1]}))
+    if killed_before != "result":
+        (folder / "learn.png").unlink()
+        (folder / "learn.rrd").unlink()
+    if killed_before == "row":
+        (folder / "learn.json").write_text(json.dumps({**curve, "episodes": curve["episodes"][:1]}))
+    assert carlab("learn", "--resume", folder)[0] == 0
+    assert json.loads((folder / "result.json").read_text()) == complete
+    assert [row["total_reward"] for row in json.loads((folder / "learn.json").read_text())["episodes"]] == [
+        row["total_reward"] for row in curve["episodes"]
+    ]
+    assert (folder / "learn.png").stat().st_size > 0
+    assert (folder / "learn.rrd").stat().st_size > 0
+
+
 def test_resuming_a_complete_run_prints_a_message(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
     _, text = carlab("learn", "--resume", learned[2])
     assert text.rpartition("╯")[2].strip()

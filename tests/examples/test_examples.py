@@ -8,7 +8,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from carlab.core.observation import encode
+from carlab.core.task import Task
+from learning.policy.sac_agent import SacSettings
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 FEW_STEPS = ["--updates", "64", "--model-steps", "20"]
@@ -71,6 +76,26 @@ def test_own_policy_holds_its_target_speed(output_of: Example) -> None:
 def test_own_task_ends_at_the_goal(output_of: Example) -> None:
     text = output_of("write_task.py")
     assert text.startswith("GOAL_REACHED")
+
+
+def test_own_task_rewards_its_end_more_than_waiting_or_leaving() -> None:
+    """Returns with the discount of the policy's training, in which no reward follows an end."""
+    task: Task = runpy.run_path(str(EXAMPLES / "write_task.py"))["StopAfterOneMetre"]()
+
+    def discounted_return(stop_m: float) -> float:
+        x = np.sign(stop_m) * np.minimum(np.arange(task.max_ticks + 1) / 30.0, abs(stop_m))
+        states = np.zeros((len(x), 6))
+        states[:, 0], states[:-1, 3] = x, 30.0 * np.diff(x)
+        features = encode(states, np.zeros((len(x), task.history_length, 2)))
+        rewards = task.reward(features[:-1], np.zeros((task.max_ticks, 2)), features[1:])
+        left = np.abs(x[1:] - 1.0) > 2.9  # The safety gate stops the car at the edge of the arena.
+        ends = np.flatnonzero(task.terminated(features[1:]) | left)
+        ticks = int(ends[0]) + 1 if len(ends) else task.max_ticks
+        return float(rewards[:ticks] @ SacSettings().discount ** np.arange(ticks))
+
+    parked = discounted_return(1.0)
+    assert parked > 1.2 * discounted_return(0.94), "waiting beside the goal"
+    assert 0.0 == discounted_return(0.0) > discounted_return(-2.0), "leaving the arena"
 
 
 @pytest.mark.timeout(900)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from terminating_parking import TerminatingParking
 
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
 from carlab.core.geofence import rectangle
@@ -183,8 +184,8 @@ def test_recorder_error_is_raised_after_the_car_is_stopped() -> None:
         assert car.stops == [False]
 
 
-def test_reached_goal_ends_the_episode_if_the_task_stops_when_parked() -> None:
-    task = ParkingTask(stop_when_parked=True)
+def test_reached_goal_ends_the_episode_if_the_task_terminates_there() -> None:
+    task = TerminatingParking()
     with SimulatedCar() as car:
         car.place(CarState(0.05, 0.0, 0.1))
         data = run_episode(car, NeutralPolicy(), task, SafetyEnvelope(), period_s=PERIOD_S)

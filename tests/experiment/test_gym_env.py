@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
+from terminating_parking import TerminatingParking
 
 import carlab.experiment.episodes.gym_registration  # noqa: F401
 from carlab.cars import default_car
@@ -89,7 +90,7 @@ def test_step_before_reset_is_refused() -> None:
 
 
 def test_environment_of_a_task_object_and_a_car_file() -> None:
-    task = ParkingTask(max_ticks=7, stop_when_parked=True)
+    task = TerminatingParking(max_ticks=7)
     env = make_env(task, vehicle=default_car().with_values({"timing.control_period": 0.05}))
     gymnasium_check(env, skip_render_check=True)
     env.reset(seed=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def make_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory
 
 
 def test_check_is_saved_in_the_model_folder_and_names_the_next_step(tmp_path: Path) -> None:
-    run = make_run(tmp_path, LAGGING, 4)
+    run = make_run(tmp_path / "my runs", LAGGING, 4)
     check_result = run_check_subprocess(run, SIMULATOR)
     assert check_result is not None
     assert (check_result.episode, check_result.verdict) == (4, "left")
@@ -42,7 +43,8 @@ def test_check_is_saved_in_the_model_folder_and_names_the_next_step(tmp_path: Pa
     saved = json.loads(check_path(run, 4).read_text())
     assert saved["sentences"] == list(check_result.sentences)
     assert saved["causes"][0]["id"] == "motor_lag"
-    assert saved["next"] == f"carlab diagnose {run.path} --car {run.path}/simulator.toml --out {run.path}/diagnosis"
+    simulator, out = f"{run.path}/simulator.toml", f"{run.path}/diagnosis"
+    assert shlex.split(saved["next"]) == ["carlab", "diagnose", str(run.path), "--car", simulator, "--out", out]
     assert saved["next"] in check_result.sentences[1]
     assert not check_path(run, 3).exists()
 

@@ -16,7 +16,7 @@ from learning.networks.particles import Network
 from learning.posterior import distillation
 from learning.posterior.distillation import MAX_NEIGHBOUR_DISTANCE, DistillationSettings, distil, measurement_points
 from learning.posterior.inference import infer
-from learning.priors.domain_models import uniform
+from learning.priors.domain_models import Pendulum, uniform
 from learning.stein import moment_direction
 
 UNITS = Normaliser(torch.tensor([0.5]), torch.tensor([1.5]), torch.tensor([1.0]), torch.tensor([2.0]))
@@ -360,23 +360,15 @@ class TestMeasurementPoints:
 
     def test_points_near_data_have_offsets_in_normalised_units(self):
         """Offsets are normal with a uniform scale up to 0.5: their standard deviation is 0.5 / sqrt(3)."""
-        units = Normaliser(torch.zeros(2), torch.tensor([1.0, 100.0]), torch.zeros(1), torch.ones(1))
-        row = torch.tensor([[3.0, -70.0]])
-        sampled_points = measurement_points(None, row.repeat(25, 1), units, generator(), count=8000, domain=row)
+        units = Normaliser(torch.zeros(4), torch.tensor([1.0, 100.0, 1.0, 1.0]), torch.zeros(1), torch.ones(1))
+        row = torch.tensor([[3.0, -70.0, 0.0, 0.0]])
+        sampled_points = measurement_points(Pendulum(), row.repeat(25, 1), units, generator(), count=8000)
         offsets = ((sampled_points - row) / units.input_std)[:4000]
-        assert torch.allclose(offsets.mean(dim=0), torch.zeros(2), atol=0.02)
-        assert torch.allclose(offsets.std(dim=0), torch.full((2,), MAX_NEIGHBOUR_DISTANCE / 3.0**0.5), rtol=0.05)
+        assert torch.allclose(offsets.mean(dim=0), torch.zeros(4), atol=0.02)
+        assert torch.allclose(offsets.std(dim=0), torch.full((4,), MAX_NEIGHBOUR_DISTANCE / 3.0**0.5), rtol=0.05)
 
     @pytest.mark.parametrize("count", [0, 19])
     def test_all_points_are_in_the_domain_with_fewer_than_20_rows(self, count):
         sampled_points = measurement_points(RandomLine(), self.rows[:count], UNITS, generator(), count=64)
         assert sampled_points.shape == (64, 1)
         assert sampled_points.max() <= 4.0
-
-    @pytest.mark.parametrize(("count", "near"), [(0, 0), (30, 32)])
-    def test_domain_points_are_the_given_ones_without_a_simulator(self, count, near):
-        others = torch.tensor([[-1.0], [0.5], [2.0]])
-        sampled_points = measurement_points(None, self.rows[:count], UNITS, generator(), count=64, domain=others)
-        assert sampled_points.shape == (64, 1)
-        assert int((sampled_points > 50.0).sum()) == near
-        assert set(sampled_points[near:, 0].tolist()) == {-1.0, 0.5, 2.0}

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from terminating_parking import TerminatingParking
 from torch import Tensor
 
 from carlab.core.geofence import can_stop_inside, rectangle
@@ -21,7 +22,8 @@ from learning.world.model_env import REWARD_SCALE, ModelEnv, policy_inputs
 HISTORY = 2
 WIDTH = 7 + 2 * HISTORY
 PERIOD_S = 1 / 30
-TASK = replace(ParkingTask(), history_length=HISTORY, max_ticks=10**9)
+TASK = ParkingTask(history_length=HISTORY, max_ticks=10**9)
+TERMINATING = TerminatingParking(history_length=HISTORY, max_ticks=10**9)
 
 
 @dataclass
@@ -186,12 +188,10 @@ def test_episode_is_truncated_after_the_ticks_of_the_task() -> None:
     assert (ended == 2).all()
 
 
-def test_parked_car_terminates_the_episode_with_stop_when_parked() -> None:
+def test_parked_car_terminates_the_episode_if_the_task_does() -> None:
     states = np.array([[0.05, 0.0, 0.1, 0.0, 0.0, 0.0]])
-    for stop in (True, False):
-        env = ModelEnv(
-            StationaryCar(), replace(TASK, stop_when_parked=stop), 1, recorded=rows_of(states), from_recorded=1.0
-        )
+    for stop, task in ((True, TERMINATING), (False, TASK)):
+        env = ModelEnv(StationaryCar(), task, 1, recorded=rows_of(states), from_recorded=1.0)
         env.reset()
         _, _, done, infos = env.step(np.zeros((1, 2), np.float32))
         assert bool(done[0]) is stop
@@ -201,7 +201,7 @@ def test_parked_car_terminates_the_episode_with_stop_when_parked() -> None:
 
 
 def test_parking_at_the_last_tick_is_not_a_truncation() -> None:
-    task = replace(TASK, stop_when_parked=True, max_ticks=1)
+    task = replace(TERMINATING, max_ticks=1)
     env = ModelEnv(StationaryCar(), task, 1, recorded=rows_of(np.zeros((1, 6))), from_recorded=1.0)
     env.reset()
     assert env.step(np.zeros((1, 2), np.float32))[3][0]["TimeLimit.truncated"] is False
@@ -270,14 +270,12 @@ def test_rollout_sums_rewards_of_each_car_until_its_episode_ends() -> None:
 
 
 def test_rollout_ends_for_a_parked_car() -> None:
-    task = replace(
-        TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
-        stop_when_parked=True,
-    )  # fmt: skip
-    total, *_ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
-    assert total.tolist() == pytest.approx([1.0] * 3), "one rewarded tick"
-    total, *_ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
-    assert total.tolist() == pytest.approx([9.0] * 3)
+    for task, ticks in ((TERMINATING, 1), (TASK, 9)):
+        at_goal = replace(
+            task, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9
+        )
+        total, *_ = ModelEnv(StationaryCar(), at_goal, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
+        assert total.tolist() == pytest.approx([ticks] * 3), "each tick is rewarded"
 
 
 @dataclass(frozen=True)

@@ -80,6 +80,19 @@ def test_folder_that_cannot_be_created_is_reported_in_one_sentence(tmp_path):
         RunDirectory.open_existing(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["log.jsonl", "learn.json.partial", "models/0001/diagnosis.json.partial", ".lock"])
+def test_folder_with_a_symbolic_link_is_not_resumed(tmp_path: Path, name: str) -> None:
+    """A folder from another person could otherwise change a file of this one."""
+    run = RunDirectory.create(tmp_path, "foreign")
+    (run.models / "0001").mkdir(parents=True)
+    own_file = tmp_path / "profile"
+    own_file.write_text("own")
+    (run.path / name).symlink_to(own_file)
+    with pytest.raises(DataError, match=rf"{name} is a symbolic link, .*; replace it by a copy\.$"):
+        RunDirectory.open_existing(run.path)
+    assert own_file.read_text() == "own"
+
+
 def test_git_state_distinguishes_changed_and_clean_trees(tmp_path):
     def git(*arguments):
         identity = ("-c", "user.name=n", "-c", "user.email=e@example.org")

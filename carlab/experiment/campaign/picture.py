@@ -34,7 +34,7 @@ class Curve:
 CURVES = (
     Curve(
         "Return",
-        {"total_reward": "on the car", "predicted_return": "in the learned car"},
+        {"total_reward": "on the car", "predicted_return": "predicted"},
         {"total_reward": "tab:blue", "predicted_return": "tab:orange"},
         marks_success=True,
     ),

@@ -7,6 +7,7 @@ part of the result; the run continues.
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +107,8 @@ def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict
 
 def next_step(run: Path) -> str:
     """The command of the full diagnosis of a run."""
-    return f"carlab diagnose {run} --car {run / SIMULATOR_FILE} --out {run / 'diagnosis'}"
+    files = (run, "--car", run / SIMULATOR_FILE, "--out", run / "diagnosis")
+    return shlex.join(["carlab", "diagnose", *map(str, files)])
 
 
 def _failed(reason: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from carlab.experiment.campaign.quick_check import EpisodeCheck
 from carlab.experiment.campaign.run_recording import write_run_recording
 from carlab.experiment.campaign.training import training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan
-from carlab.experiment.episodes.result import result_of
+from carlab.experiment.episodes.result import EpisodeResult, result_of
 from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
 
@@ -41,17 +41,27 @@ def save_row(run: RunDirectory, row: EpisodeFigures) -> list[EpisodeFigures]:
     return rows
 
 
-def restore_missing_rows(run: RunDirectory, task: Task) -> None:
-    """Restore the missing rows of recorded episodes: the program ended between their last tick and ``save_row``."""
+def restore_missing_rows(run: RunDirectory, task: Task) -> list[EpisodeResult]:
+    """Restore the missing rows of recorded episodes in learn.json: the program ended before it had reported them.
+
+    Returns:
+        The episodes without a row in learn.json or in result.json, the last file of a report.
+    """
     known = {row.episode for row in learning_curve(run)}
+    reported = {row["episode"] for row in run.result_rows}
+    unreported = []
     for number, path in enumerate(run.recordings(), start=1):
-        if number in known or not has_ticks(path):
+        file_number = int(path.stem) if path.stem.isdecimal() else number
+        if (number in known and file_number in reported) or not has_ticks(path):
             continue
         try:
-            training = training_figures(run, number)
-            save_row(run, figures_of(result_of(number, read_episode(path), task, path), training, task))
+            result = result_of(file_number, read_episode(path), task, path)
+            if number not in known:
+                save_row(run, figures_of(result, training_figures(run, number), task))
+            unreported.append(result)
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning("The row of episode %d in %s cannot be restored: %s", number, CURVE_FILE, error)
+    return unreported
 
 
 def save_check(run: RunDirectory, check: EpisodeCheck) -> None:
