@@ -11,6 +11,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.recording.audit.report import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.csv.repairing_import import import_repaired
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
 foreign = importlib.util.module_from_spec(_spec)
@@ -63,6 +64,13 @@ class TestConversion:
             import_csv(packed).episode.states,
             import_csv(foreign.write(tmp_path / "commas.csv", clean)).episode.states,
         )
+
+    def test_rows_in_reverse_order_are_to_be_sorted_not_left_out(self, clean, tmp_path):
+        path = foreign.write(tmp_path / "run.csv", {name: column[::-1] for name, column in clean.items()})
+        with pytest.raises(DataError, match=r"sort the rows by time .--stamps drop would leave out 899 of 900 rows"):
+            import_csv(path)
+        with pytest.raises(DataError, match="sort the rows by time"):
+            import_repaired(path)
 
     def test_empty_lines_before_the_header_are_skipped(self, clean, tmp_path):
         plain = foreign.write(tmp_path / "run.csv", clean, delimiter=";")

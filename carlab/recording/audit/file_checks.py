@@ -32,6 +32,9 @@ MIN_PULSE = 500.0
 MAX_ROWS_OF_A_STEP_BACK = 10
 """Rows that a corrected clock repeats for each step back; with more, the clock starts again: a second drive."""
 NUMBERING = "all further checks number the remaining rows"
+"""Clause of a sentence about rows that were left out."""
+MAX_LOST_SHARE = 0.5
+"""Share of the rows above which rows before the newest stamp are not left out: the file is not sorted by time."""
 MAX_PERIOD_S = 2.0
 """Longest plausible time between two rows; a longer one has another unit (milliseconds, nanoseconds)."""
 MAX_COMMAND = 1.05
@@ -112,6 +115,9 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
             f"the clock starts again in row {row}, so cut the file in front of it and import both parts (--stamps drop "
             f"would leave out {lost} of {rows} rows)"
         )
+        option = None
+    elif lost - repeated > MAX_LOST_SHARE * rows and mapping.stamps != "drop":
+        treatment = f"sort the rows by time (--stamps drop would leave out {lost} of {rows} rows)"
         option = None
     sentence = (
         f"Time does not increase: {repeated} stamps repeat and {back} go back, first from {t_s[k]:.6g} s in row "
