@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,6 +75,8 @@ def compare(
         progress=progress,
         stop=stop,
     )
+    faults_of_files = tuple(fault for group in groups for fault in group.faults)
+    found = replace(found, data_faults=(*faults_of_files, *found.data_faults))
     if out is not None:
         _save(found, Path(out))
     return found

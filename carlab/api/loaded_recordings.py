@@ -125,7 +125,7 @@ def _path_of(item: RecordingSource) -> Path | None:
 
 
 def load_recordings(items: list[RecordingSource], role: str, latency_s: float) -> LoadedRecordings:
-    """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
+    """Read episodes for a diagnosis: CSV files are repaired, and states with recorded ages get one known age."""
     loaded = LoadedRecordings()
     for item in items:
         loaded.uses.append(_read_item(item, role, latency_s, loaded))
@@ -145,7 +145,7 @@ def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: Loade
         return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
     path = item.path if isinstance(item, Recording) else item
     if is_csv(required_file(path)):
-        _read_csv(path, item.mapping if isinstance(item, Recording) else None, loaded)
+        _read_csv(path, item.mapping if isinstance(item, Recording) else None, latency_s, loaded)
     else:
         read = item if isinstance(item, Recording) else load(path)
         loaded.episodes += [align_states(_without_corrupt_numbers(each), latency_s) for each in read.episodes]
@@ -179,14 +179,15 @@ def _without_corrupt_numbers(episode: EpisodeData) -> EpisodeData:
     return replace(episode, states=np.where(is_plausible, episode.states, np.nan), poses=poses)
 
 
-def _read_csv(path: Path, mapping: Any, loaded: LoadedRecordings) -> None:
+def _read_csv(path: Path, mapping: Any, latency_s: float, loaded: LoadedRecordings) -> None:
     """Add a CSV's episodes and its repaired data faults; the diagnosis detects faults without repair itself."""
     from carlab.diagnosis.findings import DataFault
+    from carlab.diagnosis.state_alignment import align_states
     from carlab.recording.audit.report import Severity
     from carlab.recording.csv.repairing_import import import_repaired
 
     read = import_repaired(path, mapping=mapping)
-    loaded.episodes += list(read.imported.episodes)
+    loaded.episodes += [align_states(episode, latency_s) for episode in read.imported.episodes]
     loaded.notes.append(read.imported.announcement)
     repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
     left_out = [f for f in repaired if f.id in LEFT_OUT_ROWS]

@@ -160,7 +160,7 @@ def predict(
 
     Returns:
         The errors of the model, with and without adaptation, of constant velocity and of no change. For a model of a
-        diagnosis they agree with its report.
+        diagnosis they agree with its report to about a tenth of a noise floor.
 
     Raises:
         ConfigError: an argument is invalid.

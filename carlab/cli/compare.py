@@ -46,6 +46,8 @@ class Compare:
         report_folder(self.out)
         with search_callbacks("comparison") as callbacks:
             found = compare(**arguments_of(self, compare), **callbacks)
+        for fault in found.data_faults:
+            console.print(f"{fault.channel}: {fault.action}")
         if found.verdict == "inconclusive":
             fail(found.sentence)
             return EXIT_INCONCLUSIVE

@@ -1,7 +1,8 @@
 """Prediction errors of a simulator on a recording, computed like the held-out errors of a diagnosis.
 
 Faults of the recording are repaired; the initial states are estimated, and the velocity window and the noise unless a
-``model.toml`` states them. A ``model.toml`` therefore has the error that its report states.
+``model.toml`` states them. A ``model.toml`` therefore has the error that its report states, up to the initial states:
+the report corrects them by the car file, a replay by the model itself.
 """
 
 from __future__ import annotations

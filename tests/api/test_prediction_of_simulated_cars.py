@@ -19,3 +19,17 @@ def test_latency_of_an_effect_is_that_of_the_recorded_states(tmp_path: Path) -> 
     errors = carlab.predict(run.recordings, car, horizon_s=0.8).score.whole.errors["model"]
     assert len(errors) > 5
     assert np.sqrt(np.mean(errors**2, axis=0))[:3].max() < 5e-4, errors
+
+
+def test_states_of_an_exported_recording_have_the_same_age(tmp_path: Path) -> None:
+    """A pose of a row was exposed before the row; a pose with the time of its row counts the latency twice (2 cm)."""
+    quiet = MocapParameters(position_std_m=1e-5, yaw_std_rad=1e-4, latency_s=0.05)
+    car = tmp_path / "late.toml"
+    car.write_text(tomli_w.dumps(SimulatorConfig(mocap=quiet).to_tables()))
+    run = carlab.drive(car, policy="figure_eight", ticks=240, out=tmp_path, rerun=False, picture=False)
+    exported = carlab.load(run.recordings[0]).save(tmp_path / "drive.csv")
+    imported = carlab.load(exported).save(tmp_path / "imported.mcap")
+    for path in (exported, imported):
+        errors = carlab.predict(path, car, horizon_s=0.8).score.whole.errors["model"]
+        assert len(errors) > 5
+        assert np.sqrt(np.mean(errors**2, axis=0))[:3].max() < 3e-3, errors

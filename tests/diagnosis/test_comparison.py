@@ -154,13 +154,18 @@ def test_verb_without_a_verdict_has_the_exit_code_of_a_diagnosis_without_one(fir
 
 
 def test_verb_writes_the_result_of_the_call(first, unchanged, tmp_path, capsys):
-    paths = csv_files(tmp_path, first, unchanged)
+    """The yaw of the second file is in degrees: the repair is reported."""
+    in_degrees = unchanged.states * np.where(np.arange(6) == 2, np.degrees(1.0), 1.0)
+    paths = csv_files(tmp_path, first, replace(unchanged, states=in_degrees))
     arguments = ["compare", str(paths[0]), "--with", str(paths[1]), "--candidates", "motor_lag", "steering_offset"]
     assert run([*arguments, "--out", str(tmp_path / "out")]) == 0
-    assert "No effect or parameter of the simulator changed significantly" in capsys.readouterr().out
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "No effect or parameter of the simulator changed significantly" in printed
+    assert "yaw: repaired: Column 'yaw': yaw follows the course over ground only when read in degrees" in printed
     saved = json.loads((tmp_path / "out" / "compare.json").read_text(encoding="utf-8"))
     assert saved["schema"] == "carlab.compare/1"
     assert saved["verdict"] == "nothing"
+    assert [(fault["id"], fault["channel"]) for fault in saved["data_faults"]] == [("wrong_unit", "yaw")]
     assert run(["compare", str(paths[0]), "--with", str(paths[0])]) == 2
     assert "is in both groups" in capsys.readouterr().err
 

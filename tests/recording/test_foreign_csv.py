@@ -11,6 +11,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.recording.audit.report import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.csv.repairing_import import import_repaired
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
 foreign = importlib.util.module_from_spec(_spec)
@@ -44,6 +45,16 @@ class TestConversion:
         assert "canonical" in imported.announcement
         assert "recognised" in imported.announcement
 
+    def test_poses_have_their_capture_times_if_the_file_states_their_ages(self, clean, tmp_path):
+        ages = np.where(np.arange(len(EVEN)) % 3 == 0, 0.008, 0.012)
+        ages[5] = np.nan
+        ages[7] = ages[6] + EVEN[7] - EVEN[6]  # no new pose since the row before
+        imported = import_csv(foreign.write(tmp_path / "run.csv", {**clean, "pose_age_s": ages}))
+        stamps = imported.episode.poses[:, 0]
+        np.testing.assert_allclose(stamps, np.delete(EVEN - ages, 5), rtol=0, atol=1e-9)
+        assert stamps[5] == stamps[6]
+        np.testing.assert_array_equal(imported.episode.poses[:, 1], np.delete(clean["x"], 5))
+
     @pytest.mark.parametrize("delimiter", [";", "\t"])
     def test_gzip_delimiters_and_byte_order_mark_are_accepted(self, clean, tmp_path, delimiter):
         plain = foreign.write(tmp_path / "run.csv", clean, delimiter=delimiter)
@@ -53,6 +64,19 @@ class TestConversion:
             import_csv(packed).episode.states,
             import_csv(foreign.write(tmp_path / "commas.csv", clean)).episode.states,
         )
+
+    def test_rows_in_reverse_order_are_to_be_sorted_not_left_out(self, clean, tmp_path):
+        path = foreign.write(tmp_path / "run.csv", {name: column[::-1] for name, column in clean.items()})
+        with pytest.raises(DataError, match=r"sort the rows by time .--stamps drop would leave out 899 of 900 rows"):
+            import_csv(path)
+        with pytest.raises(DataError, match="sort the rows by time"):
+            import_repaired(path)
+
+    def test_empty_lines_before_the_header_are_skipped(self, clean, tmp_path):
+        plain = foreign.write(tmp_path / "run.csv", clean, delimiter=";")
+        padded = tmp_path / "padded.csv"
+        padded.write_text("\n# a, b, c\n \n" + plain.read_text())
+        np.testing.assert_array_equal(import_csv(padded).episode.states, import_csv(plain).episode.states)
 
     @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
     def test_stamps_in_another_unit_are_refused_until_it_is_declared(self, clean, tmp_path, unit, factor):

@@ -84,7 +84,7 @@ def compare(
     verdict: ComparisonVerdict = "changed" if changes else "nothing" if is_complete else "inconclusive"
     seconds = MonotonicClock().now_s() - began_s
     sentence = verdict_sentence(verdict, changes, is_complete=is_complete)
-    return Comparison(verdict, sentence, changes, seconds, tested, is_complete)
+    return Comparison(verdict, sentence, changes, seconds, tested, is_complete, compared.data_faults)
 
 
 def _screen(

@@ -11,6 +11,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.drive_spread import part_blocks, parts_of
+from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, stated_effects
@@ -38,6 +39,7 @@ class ComparedGroups:
     errors   (S, D) whitened errors of the reference model in each group
     parts    (S,) part of each window, in each group
     error_models  distributions of the errors of the first group
+    data_faults   faults that were found in both groups
     """
 
     config: SimulatorConfig
@@ -45,6 +47,7 @@ class ComparedGroups:
     errors: tuple[FloatArray, FloatArray]
     parts: tuple[IndexArray, IndexArray]
     error_models: CrossFittedErrors
+    data_faults: tuple[DataFault, ...]
 
     @property
     def model(self) -> ErrorModel:
@@ -73,7 +76,7 @@ def compared_groups(
         DataError: the recordings are too short or too uniform, or have different periods; the message has the remedy.
     """
     nominal = with_known_latency(nominal, (*reference, *changed))
-    reference, changed, _ = data_faults_of.check(reference, changed, nominal, alike=True)
+    reference, changed, faults = data_faults_of.check(reference, changed, nominal, alike=True)
     segments = [_checked_segments(group, k, settings) for k, group in enumerate((reference, changed))]
     periods = [t[0].period_s for t in segments]
     if max(periods) > settings.comparison.period_ratio_max * min(periods):
@@ -103,7 +106,7 @@ def compared_groups(
     parts = (parts_of(one.windows, length), parts_of(two.windows, length))
     fold = parts[0] % min(settings.comparison.error_folds, int(parts[0].max()) + 1)
     models = CrossFittedErrors.of(errors[0], fold, settings.comparison)
-    return ComparedGroups(config, (one, two), errors, parts, models)
+    return ComparedGroups(config, (one, two), errors, parts, models, tuple(faults))
 
 
 def _errors(fitter: Fitter, config: SimulatorConfig) -> FloatArray:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.findings import DataFault, Estimate
 from carlab.diagnosis.report.sentences import effect_noun, listed, number, percent, unit_text
 from sim_backends.effects import EFFECTS
 
@@ -79,6 +79,7 @@ class Comparison:
         seconds: run time [s].
         tested: all candidates before any change is accepted, the most likely first.
         is_complete: whether the comparison ended by itself; after a stop there may be more changes.
+        data_faults: faults of the recordings, with the action taken. A repair of one group can hide a change.
     """
 
     verdict: ComparisonVerdict
@@ -87,6 +88,7 @@ class Comparison:
     seconds: float = 0.0
     tested: tuple[Tested, ...] = ()
     is_complete: bool = True
+    data_faults: tuple[DataFault, ...] = ()
 
     def __repr__(self) -> str:
         """The verdict, and one sentence for each change."""

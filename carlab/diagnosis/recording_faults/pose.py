@@ -116,8 +116,9 @@ def _check_gaps(repair: EpisodeRepair) -> None:
     """Cut at gaps and at the remaining jumps (lost tracking), and count missing rows of an even clock."""
     jumps = repair.cut_at_jumps()
     if jumps:
-        fault = Fault("outliers", "x, y, yaw", f"the pose jumps {jumps} times without a return: tracking was lost")
-        repair.repaired(fault, "the recording was cut at the jumps", jumps)
+        times = "once" if jumps == 1 else f"{jumps} times"
+        fault = Fault("outliers", "x, y, yaw", f"the pose jumps {times} without a return: tracking was lost")
+        repair.repaired(fault, f"the recording was cut at the {'jump' if jumps == 1 else 'jumps'}", jumps)
     step, period = np.diff(repair.times_s), repair.period_s
     gaps = gap_rows(repair.times_s)
     is_even = np.mean(np.abs(step - period) < 0.1 * period) > 0.9

@@ -31,6 +31,10 @@ MIN_PULSE = 500.0
 """Minimum pulse width [us] of a servo: a column of larger commands has pulse widths. The maximum is about 2500."""
 MAX_ROWS_OF_A_STEP_BACK = 10
 """Rows that a corrected clock repeats for each step back; with more, the clock starts again: a second drive."""
+NUMBERING = "all further checks number the remaining rows"
+"""Clause of a sentence about rows that were left out."""
+MAX_LOST_SHARE = 0.5
+"""Share of the rows above which rows before the newest stamp are not left out: the file is not sorted by time."""
 MAX_PERIOD_S = 2.0
 """Longest plausible time between two rows; a longer one has another unit (milliseconds, nanoseconds)."""
 MAX_COMMAND = 1.05
@@ -74,7 +78,7 @@ def _cell_findings(
         sentence = f"Column '{name}' {what}; {remedy}."
         return [Finding.at(bad, "not_a_number", channel, Severity.ERROR, sentence, {"share": 1.0})]
     severity, treatment, option = (
-        (Severity.REPAIRED, "those rows were left out and the command before each was held", None)
+        (Severity.REPAIRED, f"those rows were left out and the command before each was held; {NUMBERING}", None)
         if mapping.missing == "drop"
         else (Severity.ERROR, "leave those rows out with --missing drop, or repair the file", "--missing drop")
     )
@@ -101,7 +105,7 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
     k = int(np.flatnonzero(step <= 0)[0])
     lost, rows = int((~advances).sum()), len(t_s)
     severity, treatment, option = (
-        (Severity.REPAIRED, f"{lost} of {rows} rows were left out", None)
+        (Severity.REPAIRED, f"{lost} of {rows} rows were left out; {NUMBERING}", None)
         if mapping.stamps == "drop"
         else (Severity.ERROR, "leave such rows out with --stamps drop, or sort or cut the file", "--stamps drop")
     )
@@ -111,6 +115,9 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
             f"the clock starts again in row {row}, so cut the file in front of it and import both parts (--stamps drop "
             f"would leave out {lost} of {rows} rows)"
         )
+        option = None
+    elif lost - repeated > MAX_LOST_SHARE * rows and mapping.stamps != "drop":
+        treatment = f"sort the rows by time (--stamps drop would leave out {lost} of {rows} rows)"
         option = None
     sentence = (
         f"Time does not increase: {repeated} stamps repeat and {back} go back, first from {t_s[k]:.6g} s in row "
@@ -271,8 +278,9 @@ def check_jumps(
         if mapping.gaps == "split"
         else (Severity.FAULT, "Velocities are not estimated across; cut it with --gaps split", "--gaps split")
     )
+    times = "once" if len(jumps) == 1 else f"{len(jumps)} times"
     sentence = (
-        f"The pose jumps {len(jumps)} times (first at row {jumps[0] + 1}, {t_s[jumps[0]]:.2f} s), by up to {step:.2f} "
+        f"The pose jumps {times} (first at row {jumps[0] + 1}, {t_s[jumps[0]]:.2f} s), by up to {step:.2f} "
         f"m and {turn:.2f} rad between rows: tracking was lost or another body was taken for the car. {treatment}."
     )
     evidence = {"largest_m": step, "largest_rad": turn}

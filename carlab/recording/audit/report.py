@@ -37,7 +37,8 @@ class Severity(enum.IntEnum):
 class Finding:
     """One observation about a recording.
 
-    ``rows`` are the first affected data rows (row 1 follows the header), ``count`` is the number of affected rows;
+    ``rows`` are the first affected data rows (row 1 follows the header; checks after one that left out rows number the
+    remaining rows), ``count`` is the number of affected rows;
     ``option`` is the ``carlab import`` option that acts on the finding.
     """
 

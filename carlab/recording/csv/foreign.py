@@ -27,12 +27,15 @@ from carlab.recording.column_mapping import (
 )
 from carlab.recording.csv.clocks import even_clock, with_rebuilt_clock
 from carlab.recording.csv.table import CsvTable, read_csv
+from carlab.recording.episode_builder import POSE_AGE
 from carlab.recording.faults.robust import held_at
 from carlab.recording.faults.stamps import gap_rows, segments
 from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
 SEGMENT = "segment"
 """Extra column of an episode with the numbers of the parts between gaps and jumps."""
+CAPTURE_DECIMALS = 9
+"""Decimals [s] of the capture times of poses: rows with the same pose have equal ones despite rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,10 +259,13 @@ def _episodes(
     requested, sent, findings = _commands(channels, mapping)
     parts, row_findings = _episode_rows(channels.segment, mapping)
     extra, extra_findings = _extra_columns(channels, mapping)
+    ages_s = extra.get(POSE_AGE)
     episodes = []
     for part in parts:
         times = t_s[part]
-        poses = np.zeros((0, 4)) if channels.motion is None else np.column_stack([times, states[part, :3]])
+        captured_s = times if ages_s is None else np.round(times - ages_s[part], CAPTURE_DECIMALS)
+        poses = np.column_stack([captured_s, states[part, :3]])
+        is_pose = np.isfinite(captured_s) & (channels.motion is not None)
         last = slice(part.start, part.stop - 1)
         episodes.append(
             EpisodeData(
@@ -268,7 +274,7 @@ def _episodes(
                 requested=requested[last],
                 sent=sent[last],
                 rewards=np.full(len(times) - 1, np.nan),
-                poses=poses,
+                poses=poses[is_pose],
                 metadata={**metadata, "rows": f"{part.start + 1} to {part.stop}"},
                 extra={name: column[part] for name, column in extra.items()},
             )

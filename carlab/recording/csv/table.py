@@ -54,10 +54,11 @@ class CsvTable:
 def read_csv(path: Path | str) -> CsvTable:
     """Read a file with one header line, separated by commas, semicolons or tabs; ``.gz`` is decompressed.
 
-    Lines before the header that begin with ``#`` are skipped. The header may begin with ``#``, as numpy.savetxt writes.
-    Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Numbers have a decimal point, or all have a decimal
-    comma; where that is ambiguous, their columns are texts. Raises DataError if the file is missing, empty,
-    truncated or not text, if it has a single column, or if a row has another number of cells than the header.
+    Empty lines, and lines before the header that begin with ``#``, are skipped. The header may begin with ``#``, as
+    numpy.savetxt writes. Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Numbers have a decimal point,
+    or all have a decimal comma; where that is ambiguous, their columns are texts. Raises DataError if the file is
+    missing, empty, truncated or not text, if it has a single column, or if a row has another number of cells than the
+    header.
     """
     path = Path(path)
     text = _without_comments(_read_text(path))
@@ -126,8 +127,10 @@ def _without_comments(text: str) -> str:
     """The text from its header on; a header after ``#`` has as many cells as the next line."""
     if text[:4].lower() == "sep=":  # Excel
         text = text.partition("\n")[2]
-    while text.startswith("#"):
+    while text:
         line, _, rest = text.partition("\n")
+        if line.strip() and not line.startswith("#"):
+            break
         delimiter = max(",;\t", key=line.count)
         if 0 < line.count(delimiter) == rest.partition("\n")[0].count(delimiter):
             return text.lstrip("# ")

@@ -168,8 +168,8 @@ def spike_fault(channel: str, column: FloatArray, spikes: Spikes, motion: PoseMo
         else "at no particular yaw: outliers"
     )
     observation = (
-        f"{channel} has {len(size)} spikes of {size.min():.0f} to {size.max():.0f} ({int(spikes.rows.sum())} rows with "
-        f"their tails), {where}"
+        f"{channel} has {len(size)} spikes of {size.min():.0f} to {size.max():.0f} {next(iter(UNITS[channel]))} "
+        f"({int(spikes.rows.sum())} rows with their tails), {where}"
     )
     evidence = {"spikes": len(size), "smallest": size.min(), "largest": size.max(), "share_ccw": share_ccw}
     identity = "yaw_wrap_spikes" if is_wrap else "outliers"
