@@ -64,7 +64,7 @@ def event_drive(seed: int, kind: str = "", *, length_s: float = 60.0, period_s: 
         spans.append((start_s, start_s + event.duration_s))
         start_s += float(rng.uniform(4.0, 8.0))
     human = HumanDriver(car, track, rng)
-    driven = drive(world, human, length_s, start=human.start(), integrator="dopri5", rtol=1e-6)
+    driven = drive(world, human, length_s, start=human.start(), rtol=1e-6)
     recording = record(driven, world, Noise(nominal.position_std, nominal.yaw_std), rng)
     sent = recording.commands[:-1]
     episode = EpisodeData(recording.t_s, recording.measured, sent, sent, np.zeros(len(sent)))

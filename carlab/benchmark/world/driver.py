@@ -76,10 +76,8 @@ class HumanDriver:
         elif self._mode == "reverse":
             steering = self._steering * 0.7
         throttle = self._throttle_for(vx, abs(steering))
-        return (
-            float(np.clip(steering + self._noise[0] * (self._mode != "stand"), -1.0, 1.0)),
-            float(np.clip(throttle, -1.0, 1.0)),
-        )
+        steering += float(self._noise[0]) * (self._mode != "stand")
+        return min(max(steering, -1.0), 1.0), min(max(throttle, -1.0), 1.0)
 
     def _choose_mode(self, t: float, off: float) -> None:
         rng = self._rng
@@ -109,7 +107,7 @@ class HumanDriver:
         if self._mode == "coast":
             return 0.0
         if self._mode == "stand":
-            return float(-0.3 * np.clip(vx, -1.0, 1.0)) if abs(vx) > 0.1 else 0.0
+            return -0.3 * min(max(vx, -1.0), 1.0) if abs(vx) > 0.1 else 0.0
         if self._mode == "steps":
             return self._throttle if abs(vx) < 3.0 else 0.0
         curvature = math.tan(min(turn, 1.0) * self._car.max_angle) / self._car.wheelbase

@@ -7,7 +7,7 @@ Kinematic, dynamic and blended single track after Kabzan et al., "AMZ Driverless
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,85 +116,74 @@ class Derivative:
         car = world.car
         self.angle = 0.0
         self.throttle = 0.0
-        self._world = world
         self._now = Instant()
         self._hooks = [tuple(world.hooks[stage]) for stage in STAGES]
-        self._extras = len(world.hidden(0.0))
-        self._mass = car.mass
-        self._loads = car.load_front, car.load_rear
-        self._axles = car.front_axle, car.rear_axle
-        self._inertia = car.yaw_inertia
-        self._kinematic = car.kind == "kinematic"
-        self._blend = car.kind == "blend"
+        self._no_rates = [0.0] * len(world.hidden(0.0))
+        # Read once: a car computes its loads anew, and this function is most of the time of a case.
+        self._base = car.drive_gain, car.damping, car.mass, car.yaw_inertia, car.front_axle, car.rear_axle
+        self._tyres = world.shape_front, world.shape_rear, car.load_front, car.load_rear, car.mu_front, car.mu_rear
+        self._wheelbase = car.wheelbase
+        self._kind = car.kind
 
-    def __call__(self, t: float, values: Any) -> list[float]:
-        """Evaluate at time t [s]; ``values`` is an array of the state."""
-        now, world = self._now, self._world
-        car, (front_axle, rear_axle) = world.car, self._axles
+    def __call__(self, t: float, state: list[float]) -> list[float]:
+        """Evaluate at time t [s]."""
+        now, sin, cos, atan2 = self._now, math.sin, math.cos, math.atan2
         steer, throttle, drive, load, grip, limit, tyre, body = self._hooks
-        state = values.tolist()
+        gain, damping, m, inertia, front_axle, rear_axle = self._base
+        shape_front, shape_rear, now.fz_f, now.fz_r, now.mu_f, now.mu_r = self._tyres
         now.t = t
-        now.x, now.y, now.psi, now.vx, now.vy, now.r = state[:6]
-        vx, vy, r = now.vx, now.vy, now.r
-        now.extra = state[6:]
-        now.rates = [0.0] * self._extras
+        now.x, now.y, psi, vx, vy, r, *now.extra = state
+        now.psi, now.vx, now.vy, now.r = psi, vx, vy, r
+        now.rates = rates = self._no_rates.copy()
         now.d = self.angle
         for hook in steer:
             hook(now)
         now.u = self.throttle
         for hook in throttle:
             hook(now)
-        now.sin_d = sin_d = math.sin(now.d)
-        now.cos_d = cos_d = math.cos(now.d)
-        now.drive = car.drive_gain * now.u
+        now.sin_d = sin_d = sin(now.d)
+        now.cos_d = cos_d = cos(now.d)
+        now.drive = gain * now.u
         for hook in drive:
             hook(now)
-        now.fx = now.drive - car.damping * vx
+        now.fx = now.drive - damping * vx
         front_y = vy + front_axle * r
-        now.alpha_f = math.atan2(front_y * cos_d - vx * sin_d, max(abs(vx * cos_d + front_y * sin_d), SLIP_FLOOR_MPS))
-        now.alpha_r = math.atan2(vy - rear_axle * r, max(abs(vx), SLIP_FLOOR_MPS))
-        now.shape_f = world.shape_front(now.alpha_f)
-        now.shape_r = world.shape_rear(now.alpha_r)
-        now.fz_f, now.fz_r = self._loads
-        now.mu_f, now.mu_r = car.mu_front, car.mu_rear
-        for hook in load:
-            hook(now)
-        for hook in grip:
-            hook(now)
-        for hook in limit:
-            hook(now)
+        rolling_f, rolling_r = abs(vx * cos_d + front_y * sin_d), abs(vx)
+        now.alpha_f = alpha_f = atan2(
+            front_y * cos_d - vx * sin_d, rolling_f if rolling_f > SLIP_FLOOR_MPS else SLIP_FLOOR_MPS
+        )
+        now.alpha_r = alpha_r = atan2(vy - rear_axle * r, rolling_r if rolling_r > SLIP_FLOOR_MPS else SLIP_FLOOR_MPS)
+        now.shape_f = shape_front(alpha_f)
+        now.shape_r = shape_rear(alpha_r)
+        for stage in (load, grip, limit):
+            for hook in stage:
+                hook(now)
         now.ff = -now.mu_f * now.fz_f * now.shape_f
         now.fr = -now.mu_r * now.fz_r * now.shape_r
         now.push_x = now.push_y = now.moment = 0.0
-        for hook in tyre:
-            hook(now)
-        for hook in body:
-            hook(now)
-        rates = self._body_rates(now)
-        sin_psi, cos_psi = math.sin(now.psi), math.cos(now.psi)
-        return [vx * cos_psi - vy * sin_psi, vx * sin_psi + vy * cos_psi, r, *rates, *now.rates]
-
-    def _body_rates(self, now: Instant) -> Sequence[float]:
-        m, car = self._mass, self._world.car
-        ff, sin_d, cos_d = now.ff, now.sin_d, now.cos_d
-        if not self._kinematic:
-            side = ff * cos_d
-            dynamic = (
-                (now.fx - ff * sin_d + now.push_x) / m + now.vy * now.r,
-                (now.fr + side + now.push_y) / m - now.vx * now.r,
-                (car.front_axle * side - car.rear_axle * now.fr + now.moment) / self._inertia,
-            )
-            if not self._blend:
-                return dynamic
-            share = min(max((math.hypot(now.vx, now.vy) - BLEND_FROM_MPS) / BLEND_OVER_MPS, 0.0), 1.0)
-            if share == 1.0:
-                return dynamic
-        tan_d = sin_d / cos_d
-        kinematic = (
-            (now.fx + now.push_x) / m,
-            (now.vx * car.rear_axle * tan_d / car.wheelbase - now.vy) / RELAX_S,
-            (now.vx * tan_d / car.wheelbase - now.r) / RELAX_S,
+        for stage in (tyre, body):
+            for hook in stage:
+                hook(now)
+        ff, fr = now.ff, now.fr
+        side = ff * cos_d
+        dynamic = (
+            (now.fx - ff * sin_d + now.push_x) / m + vy * r,
+            (fr + side + now.push_y) / m - vx * r,
+            (front_axle * side - rear_axle * fr + now.moment) / inertia,
         )
-        if self._kinematic:
-            return kinematic
-        return [share * a + (1.0 - share) * b for a, b in zip(dynamic, kinematic, strict=True)]
+        sin_psi, cos_psi = sin(psi), cos(psi)
+        forward, left = vx * cos_psi - vy * sin_psi, vx * sin_psi + vy * cos_psi
+        if self._kind == "kinematic" or self._kind == "blend":
+            dynamic = self._at_low_speed(now, dynamic)
+        return [forward, left, r, *dynamic, *rates]
+
+    def _at_low_speed(self, now: Instant, dynamic: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Rates of vx, vy and yaw rate of the kinematic model, or of its blend with the dynamic model."""
+        _, _, m, _, _, rear_axle = self._base
+        turn = now.vx * (now.sin_d / now.cos_d) / self._wheelbase
+        slow = (now.fx + now.push_x) / m, (rear_axle * turn - now.vy) / RELAX_S, (turn - now.r) / RELAX_S
+        if self._kind == "kinematic":
+            return slow
+        share = min(max((math.hypot(now.vx, now.vy) - BLEND_FROM_MPS) / BLEND_OVER_MPS, 0.0), 1.0)
+        ahead, across, about = (share * a + (1.0 - share) * b for a, b in zip(dynamic, slow, strict=True))
+        return ahead, across, about
