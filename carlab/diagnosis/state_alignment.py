@@ -1,9 +1,9 @@
 """Align the states of carlab recordings to a constant age, as a diagnosis requires.
 
 A control loop uses the newest pose, whose age varies with the phase of motion capture, and velocities of a line through
-earlier poses, which are older. Both ages and all poses are recorded. A local quadratic through the poses gives the
-state at the tick minus the simulator's latency of motion capture. Where too many frames are lost for the quadratic, a
-local cubic through a wider window replaces it if its noise is not larger than that of a quadratic without lost frames.
+earlier poses, which are older. Both ages and all poses are recorded. A local quadratic through the poses (a cubic, if
+they are far apart) gives the state at the tick minus the simulator's latency of motion capture. Where too many frames
+are lost for it, a local cubic through a wider window replaces it if its noise is not larger than without lost frames.
 The difference between a velocity column and the line through its poses (the effect of a filter after the estimator) is
 added to the velocity.
 """
@@ -29,6 +29,10 @@ from sim_backends.measurement import LATENCY
 HALF_WINDOW_S = 0.0251
 """Half of the quadratic's window: seven poses at 100 Hz and 120 Hz; at least two poses on each side."""
 MIN_POSES_PER_SIDE = 2
+MAX_QUADRATIC_GAP_S = 0.0251
+"""Above this time between poses, as in a CSV with one pose for each row at 30 Hz, a local cubic through five poses
+replaces the quadratic: the motion within five poses is not quadratic there, and the cubic has no bias to fourth order.
+"""
 CUBIC_HALF_WINDOWS_S = (0.075, 0.1, 0.12)
 """Halves of windows of the cubic where frames are lost. The first one with low enough noise has the least bias."""
 MAX_LINE_POSES = 64
@@ -114,12 +118,14 @@ def _frame_counts(captures_s: FloatArray) -> tuple[int, int]:
 def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
     """Variance [s2] of the window of the differentiation in ``align_states``; None if no recording was aligned.
 
-    A line through evenly spaced poses at t gives v + s2 / 2 d2v/dt2 with s2 = sum(t^4) / (3 sum(t^2)).
+    A quadratic through evenly spaced poses at t gives v + s2 / 2 d2v/dt2 with s2 = sum(t^4) / (3 sum(t^2)), a cubic v.
     """
     for episode in episodes:
         gaps = np.diff(np.unique(episode.poses[:, 0]))
         if POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra and len(gaps) >= 2 * MIN_POSES_PER_SIDE:
             gap_s = float(np.median(gaps))
+            if _order(gap_s) == 3:
+                return 0.0
             t = gap_s * np.arange(1, _half(gap_s) + 1)
             return float(np.sum(t**4) / (3.0 * np.sum(t**2)))
     return None
@@ -129,6 +135,10 @@ def _half(gap_s: float) -> int:
     return max(MIN_POSES_PER_SIDE, round(HALF_WINDOW_S / gap_s))
 
 
+def _order(gap_s: float) -> int:
+    return 3 if gap_s > MAX_QUADRATIC_GAP_S else 2
+
+
 def _local_states(poses: FloatArray, at_s: FloatArray) -> FloatArray:
     """States (n, 6) at times (n,) of local polynomials through poses (P, 4).
 
@@ -136,17 +146,17 @@ def _local_states(poses: FloatArray, at_s: FloatArray) -> FloatArray:
     """
     t_s = poses[:, 0]
     gap_s = float(np.median(np.diff(t_s)))
-    half = _half(gap_s)
+    half, order = _half(gap_s), _order(gap_s)
     widest_s = 2.0 * half * 1.5 * gap_s
     complete = np.zeros((2 * half + 1, 4))
     complete[:, 0] = gap_s * np.arange(-half, half + 1)
-    max_gain = 1.001 * _polynomial(complete, 0.0, 2)[1]
+    max_gain = 1.001 * _polynomial(complete, 0.0, order)[1]
     states = np.full((len(at_s), 6), np.nan)
     for k, moment_s in enumerate(at_s):
         nearest = int(np.argmin(np.abs(t_s - moment_s)))
         near = poses[max(nearest - half, 0) : nearest + half + 1]
         if _has_both_sides(near, moment_s) and near[-1, 0] - near[0, 0] <= widest_s:
-            states[k] = _polynomial(near, moment_s, 2)[0]
+            states[k] = _polynomial(near, moment_s, order)[0]
             continue
         for half_window_s in CUBIC_HALF_WINDOWS_S:
             near = poses[np.abs(t_s - moment_s) <= half_window_s + 1e-6]

@@ -16,8 +16,11 @@ BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
 
 HALF_WINDOW_S = 0.05
-"""Half the span of the fit [s]: eleven samples at 100 Hz, the minimum of five at 30 Hz."""
+"""Half the span of the fit [s]: eleven samples at 100 Hz, five at 40 Hz."""
 MIN_HALF_ROWS = 2
+MAX_WIDE_PERIOD_S = 0.0251
+"""Above this period the fit has three rows: the motion of a car within five rows is not quadratic there, and the
+measurement model describes the mean velocity of two periods well."""
 _BLOCK_SAMPLES = 500_000
 """Samples of windows that are in memory at once."""
 _MIN_PARABOLA_SQUARE = 1e-28
@@ -75,7 +78,7 @@ def pose_motion(
     """Differentiate a pose. All arguments (N,); rows of different ``segment`` numbers are fitted separately."""
     dt = np.diff(t_s)
     period = float(np.median(dt[dt > 0])) if np.any(dt > 0) else 1.0
-    half = max(MIN_HALF_ROWS, round(HALF_WINDOW_S / period))
+    half = 1 if period > MAX_WIDE_PERIOD_S else max(MIN_HALF_ROWS, round(HALF_WINDOW_S / period))
     yaw = yaw_rad.copy()
     rates = np.zeros((3, len(t_s)))
     for number in np.unique(segment):

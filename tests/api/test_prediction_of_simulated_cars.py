@@ -1,5 +1,6 @@
 """A simulator predicts the recordings of the simulated car that has its own parameters."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -33,3 +34,19 @@ def test_states_of_an_exported_recording_have_the_same_age(tmp_path: Path) -> No
         errors = carlab.predict(path, car, horizon_s=0.8).score.whole.errors["model"]
         assert len(errors) > 5
         assert np.sqrt(np.mean(errors**2, axis=0))[:3].max() < 3e-3, errors
+
+
+def test_poses_alone_at_30_hz_are_predicted_to_the_noise_floor(tmp_path: Path) -> None:
+    """With other velocities than those of the measurement model, a diagnosis names physics of a car that lacks none."""
+    run = carlab.drive("sim", policy="excitation", ticks=900, seed=5, out=tmp_path, rerun=False, picture=False)
+    exported = carlab.load(run.recordings[0]).save(tmp_path / "drive.csv")
+    with exported.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    poses = tmp_path / "poses.csv"
+    with poses.open("w", newline="") as file:
+        columns = ("t", "x", "y", "yaw", "steering", "throttle")
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    for path in (poses, exported):
+        assert carlab.predict(path, "sim").summary["model"].score < 1.3

@@ -84,6 +84,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Name the tests that ran again."""
     reports = (report for kind in ("passed", "failed", "error") for report in terminalreporter.getreports(kind))
-    lines = {f"{report.nodeid}: {name} {value}" for report in reports for name, value in report.user_properties}
+    properties = ((report.nodeid, getattr(report, "user_properties", ())) for report in reports)  # not of a collection
+    lines = {f"{test}: {name} {value}" for test, own in properties for name, value in own}
     for line in sorted(line for line in lines if PROPERTY in line):
         terminalreporter.write_line(line)

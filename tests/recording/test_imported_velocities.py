@@ -13,6 +13,8 @@ from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.faults import robust
 from carlab.recording.pose_velocity import pose_motion
+from sim_backends.array_ops import FLOATS
+from sim_backends.measurement import windowed
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
 foreign = importlib.util.module_from_spec(_spec)
@@ -118,6 +120,22 @@ def test_velocities_are_slopes_of_local_quadratics(rows):
         window = slice(first, first + width)
         slope = np.polyfit(t_s[window] - t_s[row], x_m[window], min(2, width - 1))[-2]
         assert motion.vx[row] == pytest.approx(slope, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("frequency_hz", [0.5, 2.0, 4.0, 7.0])
+def test_measurement_model_describes_velocities_of_poses_at_30_hz(frequency_hz):
+    """A quadratic through five poses has less than half of the velocity at 5 Hz; the model would predict more."""
+    period_s, omega = 1.0 / 30.0, 2.0 * np.pi * frequency_hz
+    t_s = period_s * np.arange(300)
+    zeros = np.zeros(300)
+    motion = pose_motion(t_s, np.sin(omega * t_s) / omega, zeros, zeros, zeros)
+    states = [(0.0, 0.0, 0.0, v, 0.0, 0.0) for v in np.cos(omega * t_s).tolist()]
+    variance_s2 = (2.0 * period_s) ** 2 / 12.0
+    modelled = [
+        windowed(FLOATS, now, (before, now, after), period_s, variance_s2)[3]
+        for before, now, after in zip(states, states[1:], states[2:], strict=False)
+    ]
+    np.testing.assert_allclose(motion.vx[1:-1], modelled, atol=0.03)
 
 
 def test_stamps_that_coincide_but_for_rounding_have_finite_velocities():
