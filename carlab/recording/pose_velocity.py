@@ -16,11 +16,13 @@ BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
 
 HALF_WINDOW_S = 0.05
-"""Half the span of the fit [s]: eleven samples at 100 Hz, five at 40 Hz."""
+"""Half the span of the fit [s]: eleven samples at 100 Hz, the minimum of five at 30 Hz."""
 MIN_HALF_ROWS = 2
-MAX_WIDE_PERIOD_S = 0.0251
-"""Above this period the fit has three rows: the motion of a car within five rows is not quadratic there, and the
-measurement model describes the mean velocity of two periods well."""
+STATE_HALF_WINDOW_S = 0.0334
+"""The same for velocities of states: seven rows at 100 Hz, five at 40 to 60 Hz. A longer window has less noise, but
+filters the motion of a car more than the measurement model predicts (``sim_backends.measurement``)."""
+MAX_FIVE_ROW_PERIOD_S = 0.0251
+"""Above this period the fit for states has three rows, for the same reason."""
 _BLOCK_SAMPLES = 500_000
 """Samples of windows that are in memory at once."""
 _MIN_PARABOLA_SQUARE = 1e-28
@@ -73,12 +75,29 @@ def pose_jumps(t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: Float
 
 
 def pose_motion(
-    t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray, segment: FloatArray
+    t_s: FloatArray,
+    x_m: FloatArray,
+    y_m: FloatArray,
+    yaw_rad: FloatArray,
+    segment: FloatArray,
+    *,
+    for_states: bool = False,
 ) -> PoseMotion:
-    """Differentiate a pose. All arguments (N,); rows of different ``segment`` numbers are fitted separately."""
+    """Differentiate a pose.
+
+    Args:
+        t_s: stamps (N,).
+        x_m: position (N,).
+        y_m: position (N,).
+        yaw_rad: yaw (N,).
+        segment: numbers (N,); rows of different numbers are fitted separately.
+        for_states: use the shorter window of states; by default the longer one with less noise, for checks of columns.
+    """
     dt = np.diff(t_s)
     period = float(np.median(dt[dt > 0])) if np.any(dt > 0) else 1.0
-    half = 1 if period > MAX_WIDE_PERIOD_S else max(MIN_HALF_ROWS, round(HALF_WINDOW_S / period))
+    half = max(MIN_HALF_ROWS, round((STATE_HALF_WINDOW_S if for_states else HALF_WINDOW_S) / period))
+    if for_states and period > MAX_FIVE_ROW_PERIOD_S:
+        half = 1
     yaw = yaw_rad.copy()
     rates = np.zeros((3, len(t_s)))
     for number in np.unique(segment):

@@ -159,7 +159,7 @@ class TestConversion:
         truth = np.column_stack([foreign.speed(t), np.zeros_like(t), foreign.yaw_rate(t)])
         error = (episode.states[:, 3:] - truth)[inner]
         # Slope of a least-squares line through W samples at spacing dt: std * sqrt(12 / (W (W^2 - 1))) / dt.
-        width = 5 if rate_hz == 30.0 else 11
+        width = 3 if rate_hz == 30.0 else 7
         gain = np.sqrt(12 / (width * (width**2 - 1))) * rate_hz
         assert np.std(error[:, 0]) < 1.5 * 3e-4 * gain + 0.002
         assert np.std(error[:, 2]) < 1.5 * 1e-3 * gain + 0.002

@@ -109,11 +109,12 @@ def test_reference_that_is_not_compared_is_reported(tmp_path):
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 400])
-def test_velocities_are_slopes_of_local_quadratics(rows):
+@pytest.mark.parametrize("for_states", [False, True])
+def test_velocities_are_slopes_of_local_quadratics(rows, for_states):
     rng = np.random.default_rng(3)
     t_s = np.cumsum(rng.uniform(0.002, 0.03, rows))
     x_m, y_m = rng.normal(size=(2, rows))
-    motion = pose_motion(t_s, x_m, y_m, np.zeros(rows), np.zeros(rows))
+    motion = pose_motion(t_s, x_m, y_m, np.zeros(rows), np.zeros(rows), for_states=for_states)
     width = min(2 * motion.half_rows + 1, rows)
     for row in range(rows):
         first = min(max(row - motion.half_rows, 0), rows - width)
@@ -128,7 +129,7 @@ def test_measurement_model_describes_velocities_of_poses_at_30_hz(frequency_hz):
     period_s, omega = 1.0 / 30.0, 2.0 * np.pi * frequency_hz
     t_s = period_s * np.arange(300)
     zeros = np.zeros(300)
-    motion = pose_motion(t_s, np.sin(omega * t_s) / omega, zeros, zeros, zeros)
+    motion = pose_motion(t_s, np.sin(omega * t_s) / omega, zeros, zeros, zeros, for_states=True)
     states = [(0.0, 0.0, 0.0, v, 0.0, 0.0) for v in np.cos(omega * t_s).tolist()]
     variance_s2 = (2.0 * period_s) ** 2 / 12.0
     modelled = [

@@ -221,7 +221,8 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
     pose = [values["x"], values["y"], values["yaw"]]
     columns = mapping.velocity_columns(values)
     lag = mapping.velocity_lag_s
-    sources, vx, vy, yaw_rate = [], motion.vx, motion.vy, motion.yaw_rate
+    own = pose_motion(t_s, *pose, channels.segment, for_states=True)
+    sources, vx, vy, yaw_rate = [], own.vx, own.vy, own.yaw_rate
     if "vx" in columns:
         vx, vy = values["vx"], values["vy"]
         sources.append(f"vx, vy: columns in the {mapping.velocity_frame} frame")
@@ -229,7 +230,7 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
             vx, vy = to_body(vx, vy, np.interp(t_s - lag, t_s, motion.yaw_unwrapped))
             sources[-1] += f", rotated by the yaw of {lag * 1e3:.1f} ms before"
     else:
-        sources.append(f"vx, vy: {motion.method()}")
+        sources.append(f"vx, vy: {own.method()}")
     if "yaw_rate" in columns:
         yaw_rate = values["yaw_rate"]
         sources.append("yaw_rate: column")
@@ -237,7 +238,7 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
             yaw_rate = np.where(spikes, np.interp(t_s - lag, t_s, motion.yaw_rate), yaw_rate)
             sources[-1] += f", {int(spikes.sum())} rows of wrap spikes taken from the pose"
     else:
-        sources.append(f"yaw_rate: {motion.method()}")
+        sources.append(f"yaw_rate: {own.method()}")
     notes = {"velocity_source": "; ".join(sources), "velocity_delay_s": f"{lag if columns else 0.0:.6g}"}
     return np.column_stack([*pose, vx, vy, yaw_rate]), notes
 
