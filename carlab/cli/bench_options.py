@@ -66,8 +66,9 @@ class BenchOptions:
     """regression, carlab's methods: gp-sim-posterior (a simulator with a Gaussian-process discrepancy), sim-posterior
     (a simulator without a discrepancy), gp-posterior (a Gaussian process without a simulator), gp-sim-average (average
     of these three). The paper's: sim-fsvgd, fsvgd (as in the authors' code), sim-fsvgd-corrected, fsvgd-corrected
-    (without the errors of that code). Baselines: SysID, GreyBox, ensemble, ridge. parking: some of gp-sim-posterior,
-    gp-posterior, sim-fsvgd, sim-fsvgd-corrected, fsvgd. All by default."""
+    (without the errors of that code). Only if named: sim-fsvgd-kde, sim-fsvgd-ssge, sim-fsvgd-nu (other estimators of
+    the prior's score), sim-fsvgd-no-discrepancy. Baselines: SysID, GreyBox, ensemble, ridge. parking: some of
+    gp-sim-posterior, gp-posterior, sim-fsvgd, sim-fsvgd-corrected, fsvgd. By default all others."""
 
     structure: bool = False
     """regression with a pendulum: give every method a simulator with further terms (friction by the rate; for

@@ -34,11 +34,23 @@ MIN_NOISE = 1e-4
 """Lower bound of the likelihood's standard deviation, in normalised units."""
 
 
-class FunctionPrior(Protocol):
-    """A prior over functions as Gaussian marginals on a pool of inputs, in normalised units."""
+class FunctionMarginal(Protocol):
+    """A distribution of function values at N points."""
 
-    def marginal(self, chosen: Tensor) -> Marginal:
-        """Gaussian at the pool's inputs with indices ``chosen`` (N,)."""
+    def score(self, values: Tensor) -> Tensor:
+        """Gradient of the log density by values (L, N, O)."""
+        ...
+
+    def precision(self) -> Tensor:
+        """Inverse of the covariance of each output (O, N, N)."""
+        ...
+
+
+class FunctionPrior(Protocol):
+    """A prior over functions as marginals on a pool of inputs, in normalised units."""
+
+    def marginal(self, chosen: Tensor) -> FunctionMarginal:
+        """Distribution at the pool's inputs with indices ``chosen`` (N,)."""
         ...
 
 

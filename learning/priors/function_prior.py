@@ -35,10 +35,15 @@ class Marginal:
         solved: Tensor = torch.cholesky_solve(deviation, self.factor)
         return -solved.permute(2, 1, 0)
 
+    def whitened(self, values: Tensor) -> Tensor:
+        """Values (L, N, O) minus the mean, with the inverse of the factor applied: (O, N, L)."""
+        deviation = (values - self.mean).permute(2, 1, 0)
+        white: Tensor = torch.linalg.solve_triangular(self.factor, deviation, upper=False)
+        return white
+
     def log_density(self, values: Tensor) -> Tensor:
         """Log density (L,) of values (L, N, O)."""
-        deviation = (values - self.mean).permute(2, 1, 0)
-        white = torch.linalg.solve_triangular(self.factor, deviation, upper=False)
+        white = self.whitened(values)
         count = white.shape[0] * white.shape[1]
         half_log = self.factor.diagonal(dim1=1, dim2=2).log().sum()
         log_two_pi = torch.log(torch.tensor(2.0 * torch.pi)).item()

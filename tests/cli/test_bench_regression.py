@@ -16,6 +16,7 @@ from carlab.studies.regression.scores import summarised
 from carlab.studies.regression.study import run_study
 from learning.baselines.ridge import Ridge
 from learning.functional_svgd.fsvgd import fit_fsvgd
+from learning.functional_svgd.score_estimators import KernelDensity, NuMethod, SpectralStein
 from learning.posterior.residuals import fit_residuals
 from learning.priors.domain_models import draw_parameters
 
@@ -215,6 +216,27 @@ def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
     assert [(s.repulsion, s.prior_exponent) for s in received.values()] == [
         (0.05, 1.0), (1.0, 1.0), (0.05, 1.0 / (20 * (8 + 32))), (1.0, 1.0),
     ]  # fmt: skip
+
+
+def test_variants_change_only_the_prior_of_sim_fsvgd(monkeypatch):
+    received = []
+
+    def spy(inputs, outputs, pool, prior, normaliser, settings):
+        received.append((prior, settings))
+        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
+
+    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
+    names = ("sim-fsvgd", *regression_methods.VARIANTS)
+    scores = list(run_study("pendulum", rows=(5,), seeds=1, methods=names))
+    assert [score.method for score in scores if score.failed is None] == list(names)
+    (published, settings), *variants = received
+    assert all(used == settings for _, used in variants)
+    *estimated, (exact, _) = variants
+    assert [type(prior.estimator) for prior, _ in estimated] == [KernelDensity, SpectralStein, NuMethod]
+    for prior in (exact, *(prior.prior for prior, _ in estimated)):
+        assert torch.equal(prior.draws, published.draws)
+    assert [prior.prior.discrepancy for prior, _ in estimated] == [published.discrepancy] * 3
+    assert exact.discrepancy is None
 
 
 @pytest.mark.usefixtures("short_identification")

@@ -4,7 +4,8 @@ carlab's methods (``gp-...``) condition a Gaussian process (``learning.posterior
 average several by held-out density. ``sim-fsvgd`` and ``fsvgd`` are the paper's (``functional_svgd.fsvgd``) with
 the steps, batches, points, bandwidth and starting noise of the authors' public code; prior moments come from a fixed
 set of draws. Their ``-corrected`` forms correct two errors of that code: the repulsive term divided by the number of
-particles, and the almost absent Gaussian-process prior of FSVGD.
+particles, and the almost absent Gaussian-process prior of FSVGD. ``VARIANTS`` of ``sim-fsvgd`` have another estimator
+of the prior's score, or no discrepancy.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from learning.baselines.ensemble import deep_ensemble
 from learning.baselines.ridge import Ridge
 from learning.baselines.system_identification import GreyBox, IdentifiedSimulator, identify
 from learning.evaluation import Mixture, Prediction
+from learning.functional_svgd.estimated_prior import EstimatedPrior
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit_fsvgd
+from learning.functional_svgd.score_estimators import KernelDensity, NuMethod, ScoreEstimator, SpectralStein
 from learning.networks.normaliser import Normaliser
 from learning.posterior.averaging import average
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
@@ -179,15 +182,24 @@ class FitTask:
 
         return average([fit(*candidate) for candidate in candidates], self.data.inputs, self.data.outputs, self.seed)
 
-    def sim_fsvgd(self, *, corrected: bool) -> Model:
-        """The paper's Sim-FSVGD."""
+    def sim_fsvgd(
+        self, *, corrected: bool = False, estimator: ScoreEstimator | None = None, with_discrepancy: bool = True
+    ) -> Model:
+        """The paper's Sim-FSVGD.
+
+        Args:
+            corrected: without the errors of the authors' code.
+            estimator: of the prior's score; None: the paper's Gaussian fit.
+            with_discrepancy: whether the simulator has the authors' discrepancy process.
+        """
         case, normaliser = self.case, self.normaliser
         pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
         prior_inputs = torch.cat([self.data.inputs, pool])
         with torch.no_grad():
             parameters = draw_parameters(case.prior, PRIOR_DRAWS, generator).to(prior_inputs)
             draws = normaliser.outputs(case.prior(prior_inputs, parameters))
-        prior = SimulatorPrior(draws, prior_inputs, case.discrepancy())
+        gaussian = SimulatorPrior(draws, prior_inputs, case.discrepancy() if with_discrepancy else None)
+        prior = gaussian if estimator is None else EstimatedPrior(gaussian, estimator, self.seed)
         settings = self.authors_settings(with_simulator=True, corrected=corrected)
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
@@ -234,5 +246,12 @@ METHODS: dict[str, Callable[[FitTask], Model]] = {
     "ridge": FitTask.ridge,
 }
 """Methods by their name in tables and on the command line; ``sim-posterior`` has no model discrepancy."""
-PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected")
+VARIANTS: dict[str, Callable[[FitTask], Model]] = {
+    "sim-fsvgd-kde": lambda task: task.sim_fsvgd(estimator=KernelDensity()),
+    "sim-fsvgd-ssge": lambda task: task.sim_fsvgd(estimator=SpectralStein(from_normal=True)),
+    "sim-fsvgd-nu": lambda task: task.sim_fsvgd(estimator=NuMethod(from_normal=True)),
+    "sim-fsvgd-no-discrepancy": lambda task: task.sim_fsvgd(with_discrepancy=False),
+}
+"""``sim-fsvgd`` with another estimator of the prior's score, or without a discrepancy; a study has them only by name."""
+PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected", *VARIANTS)
 """The paper's algorithms; their inputs are in the world frame."""

@@ -13,7 +13,7 @@ import numpy as np
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError, DataError
 from carlab.studies.regression.cases import CASES, Case, Data
-from carlab.studies.regression.methods import METHODS, PAPER_METHODS, FitTask
+from carlab.studies.regression.methods import METHODS, PAPER_METHODS, VARIANTS, FitTask
 from carlab.studies.regression.scores import Score, failed_score
 from learning.evaluation import (
     Mixture,
@@ -77,7 +77,7 @@ def plan_study(
         case: name in ``CASES``, or a case.
         rows: numbers of rows; by default those of the case.
         seeds: data and fit have the same seed.
-        methods: names in ``METHODS``; by default all.
+        methods: names in ``METHODS`` or ``VARIANTS``; by default all of ``METHODS``.
         structure: every method knows the structured simulator of the case.
         data: folder of the authors' arrays; None: the study generates the data.
 
@@ -87,8 +87,9 @@ def plan_study(
     """
     if isinstance(case, str) and case not in CASES:
         raise ConfigError(f"There is no case '{case}'; choose {', '.join(CASES)}.")
-    if unknown := [m for m in methods if m not in METHODS]:
-        raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(METHODS)}.")
+    known = METHODS | VARIANTS
+    if unknown := [m for m in methods if m not in known]:
+        raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(known)}.")
     chosen = CASES[case] if isinstance(case, str) else case
     if structure:
         chosen = chosen.structured()
@@ -150,11 +151,11 @@ def run_study(
 
 
 def scored(case: Case, data: Data, count: int, seed: int, method: str, *, steps: int | None = None) -> Score:
-    """Fit one method of ``METHODS`` to rows of a case and score it on the test rows; a failed fit gives its reason."""
+    """Fit one method to rows of a case and score it on the test rows; a failed fit gives its reason."""
     clock = MonotonicClock()
     began_s = clock.now_s()
     try:
-        model = METHODS[method](FitTask(case, data, seed, steps))
+        model = (METHODS | VARIANTS)[method](FitTask(case, data, seed, steps))
         seconds = clock.now_s() - began_s
         prediction = model.predict(data.test_inputs)
         figures = (
