@@ -252,6 +252,6 @@ VARIANTS: dict[str, Callable[[FitTask], Model]] = {
     "sim-fsvgd-nu": lambda task: task.sim_fsvgd(estimator=NuMethod(from_normal=True)),
     "sim-fsvgd-no-discrepancy": lambda task: task.sim_fsvgd(with_discrepancy=False),
 }
-"""``sim-fsvgd`` with another estimator of the prior's score, or without a discrepancy; a study has them only by name."""
+"""``sim-fsvgd`` with another estimator of the prior's score, or without a discrepancy; a study must name them."""
 PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected", *VARIANTS)
 """The paper's algorithms; their inputs are in the world frame."""
