@@ -221,7 +221,7 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
     pose = [values["x"], values["y"], values["yaw"]]
     columns = mapping.velocity_columns(values)
     lag = mapping.velocity_lag_s
-    own = pose_motion(t_s, *pose, channels.segment, for_states=True)
+    own = pose_motion(t_s, values["x"], values["y"], values["yaw"], channels.segment, for_states=True)
     sources, vx, vy, yaw_rate = [], own.vx, own.vy, own.yaw_rate
     if "vx" in columns:
         vx, vy = values["vx"], values["vy"]
