@@ -271,7 +271,7 @@ class SafeCar:
         self._seen: Observation | None = None
         self._frozen = FrozenPoseDetector(envelope.frozen_pose_s)
         self._late = LatePoseDetector(envelope)
-        self._doubtful_since_s: float | None = None
+        self._pose_problems_since_s: float | None = None
         self._active: frozenset[str] = frozenset()
         self._watchdog_trips = 0
 
@@ -281,7 +281,7 @@ class SafeCar:
         self.state = SafetyState.ARMED
         self._sent, self._sent_s, self._seen = NEUTRAL, None, None
         self._watchdog_trips = self.car.watchdog_trips
-        self._doubtful_since_s = None
+        self._pose_problems_since_s = None
         self._frozen.reset()
         self._late.reset()
 
@@ -312,8 +312,8 @@ class SafeCar:
             kinds["stale_pose"] = f"The pose is {age_s * 1e3:.0f} ms old: neutral until a fresh pose arrives."
         elif not observation.velocity_valid:
             kinds["unknown_speed"] = "Too few poses to estimate the speed: neutral until more arrive."
-        elif doubt := self._pose_doubt(now_s):
-            kinds["doubtful_pose"] = f"Neutral while motion capture reports: {doubt}"
+        elif problems := self._pose_problems(now_s):
+            kinds["pose_problems"] = f"Neutral while motion capture reports: {problems}"
         if kinds:
             target = NEUTRAL
             self.state = SafetyState.PAUSED
@@ -340,17 +340,17 @@ class SafeCar:
         self.state = SafetyState.DISARMED if planned else SafetyState.FAULT
         self.car.stop(planned=planned)
 
-    def _pose_doubt(self, now_s: float) -> str:
-        """Suspected errors of motion capture, such as a wrong axis, which shows itself only once the car has turned.
+    def _pose_problems(self, now_s: float) -> str:
+        """Reasons why the poses may be wrong, as one text. If they last for ``lost_pose_s``, the episode ends.
 
-        Ends the episode if there have been any for ``lost_pose_s``.
+        Arming checks them too, but a wrong axis is visible only after the car has turned or moved sideways.
         """
         problems = self.car.pose_problems()
         if not problems:
-            self._doubtful_since_s = None
-        elif self._doubtful_since_s is None:
-            self._doubtful_since_s = now_s
-        elif now_s - self._doubtful_since_s > self.envelope.lost_pose_s:
+            self._pose_problems_since_s = None
+        elif self._pose_problems_since_s is None:
+            self._pose_problems_since_s = now_s
+        elif now_s - self._pose_problems_since_s > self.envelope.lost_pose_s:
             self._end(EndReason.TRACKING_LOST, "Poses arrive, but they may be wrong.", now_s)
         return " ".join(problems)
 

@@ -3,9 +3,9 @@
 A control loop uses the newest pose, whose age varies with the phase of motion capture, and velocities of a line through
 earlier poses, which are older. Both ages and all poses are recorded. A local quadratic through the poses (a cubic, if
 they are far apart) gives the state at the tick minus the simulator's latency of motion capture. Where too many frames
-are lost for it, a local cubic through a wider window replaces it if its noise is not larger than without lost frames.
-The difference between a velocity column and the line through its poses (the effect of a filter after the estimator) is
-added to the velocity.
+are lost for this polynomial, a local cubic through a wider window is used, if its noise is not larger than that of the
+polynomial without lost frames. The difference between a velocity column and the line through its poses (the effect of a
+filter after the estimator) is added to the velocity.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from carlab.api import learning
 from carlab.cli import run
 from carlab.experiment.campaign.training import TrainingRequest
 from carlab.recording.mcap.source import read_episode
-from carlab.recording.run_folder import RunDirectory
 
 Carlab = Callable[..., tuple[int, str]]
 
@@ -177,21 +176,6 @@ def test_resume_accepts_a_car_file_with_equal_parameters(
     code, text = carlab("learn", "--resume", folder, "--car", same)
     assert code == 0
     assert "is complete" in text
-
-
-def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_path: Path) -> None:
-    (tmp_path / "some").mkdir()
-    code, text = carlab("learn", "--resume", tmp_path / "some")
-    assert code == 1
-    assert "is not the folder of a run of carlab learn (it has no campaign.json)" in text
-    assert list((tmp_path / "some").iterdir()) == []
-    driven = RunDirectory.create(tmp_path, "driven")
-    before = set(driven.path.rglob("*"))
-    code, text = carlab("learn", "--resume", driven.path)
-    assert code == 1
-    assert "is not the folder of a run of carlab learn (it has no campaign.json)" in text
-    assert "Errno" not in text
-    assert set(driven.path.rglob("*")) == before
 
 
 @pytest.mark.parametrize(

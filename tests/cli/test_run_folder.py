@@ -19,6 +19,7 @@ from carlab.experiment.episodes.interrupts import Interrupts
 from carlab.experiment.episodes.scripted_policies import ReplayPolicy
 from carlab.experiment.episodes.teleop_policy import KeyboardSource, TeleopInput
 from carlab.recording.mcap.source import read_episode
+from carlab.recording.run_folder import RunDirectory
 
 Carlab = Callable[..., tuple[int, str]]
 
@@ -174,3 +175,18 @@ def test_key_gives_the_maximum_throttle(
     assert carlab("drive", *argv)[0] == 0
     (path,) = tmp_path.glob("*/episodes/*.mcap")
     assert read_episode(path).sent[-1, 1] == pytest.approx(throttle)
+
+
+def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_path: Path) -> None:
+    (tmp_path / "some").mkdir()
+    code, text = carlab("learn", "--resume", tmp_path / "some")
+    assert code == 1
+    assert "is not the folder of a run of carlab learn (it has no campaign.json)" in text
+    assert list((tmp_path / "some").iterdir()) == []
+    driven = RunDirectory.create(tmp_path, "driven")
+    before = set(driven.path.rglob("*"))
+    code, text = carlab("learn", "--resume", driven.path)
+    assert code == 1
+    assert "is not the folder of a run of carlab learn (it has no campaign.json)" in text
+    assert "Errno" not in text
+    assert set(driven.path.rglob("*")) == before

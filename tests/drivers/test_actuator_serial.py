@@ -290,12 +290,6 @@ def test_suspended_process_is_no_fault_if_the_port_accepts_the_bytes(
     assert link.statistics.writes == 1
 
 
-@pytest.mark.parametrize("baud", [2**31, 10**30])
-def test_baud_that_no_port_has_is_refused(serial_firmware: SerialFirmware, baud: int) -> None:
-    with pytest.raises(NotReadyError, match=f"Serial port {serial_firmware.port} cannot be opened"):
-        SerialLink(serial_firmware.port, baud).open()
-
-
 def test_garbage_lost_and_broken_frames_are_tolerated_and_counted(tmp_path: Path) -> None:
     faults = WireFaults(drop_share=0.05, corrupt_share=0.2, seed=3)
     firmware = SerialFirmware(VescFirmware(CommandLog()), faults=faults)

@@ -47,3 +47,9 @@ def test_port_that_another_program_holds_is_reported(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(serial, "Serial", busy)
     with pytest.raises(NotReadyError, match="another program uses it; close that program"):
         SerialLink("/dev/null").open()
+
+
+@pytest.mark.parametrize("baud", [2**31, 10**30])
+def test_baud_that_no_port_has_is_refused(baud: int) -> None:
+    with SerialFirmware(VescFirmware(CommandLog())) as firmware, pytest.raises(NotReadyError, match="cannot be opened"):
+        SerialLink(firmware.port, baud).open()

@@ -25,11 +25,6 @@ def clean():
     return foreign.drive(EVEN)
 
 
-def jittered(rng, rate_hz, seconds):
-    t = np.arange(int(rate_hz * seconds)) / rate_hz
-    return t + rng.uniform(-0.3, 0.3, len(t)) / rate_hz
-
-
 class TestConversion:
     def test_canonical_file_is_imported_exactly(self, clean, tmp_path):
         imported = import_csv(foreign.write(tmp_path / "run.csv", clean))
@@ -143,32 +138,6 @@ class TestConversion:
         np.testing.assert_allclose(states[1:, 3], v[1:], atol=1e-3)
         np.testing.assert_allclose(states[1:, 4], 0.0, atol=1e-3)
         assert float(imported.episode.metadata["velocity_delay_s"]) == pytest.approx(1 / 60, rel=1e-5)
-
-    @pytest.mark.parametrize("rate_hz", [30.0, 100.0])
-    def test_velocities_from_a_noisy_pose_have_the_expected_error_and_no_delay(self, rng, rate_hz, tmp_path):
-        t = jittered(rng, rate_hz, 25.0)
-        columns = foreign.drive(t)
-        for name, std in (("x", 3e-4), ("y", 3e-4), ("yaw", 1e-3)):
-            columns[name] = columns[name] + rng.normal(0.0, std, len(t))
-        columns["yaw"] = (columns["yaw"] + np.pi) % (2 * np.pi) - np.pi
-        assert np.sum(np.abs(np.diff(columns["yaw"])) > 5) >= 2
-        for name in ("vx", "vy", "yaw_rate"):
-            del columns[name]
-        episode = import_csv(foreign.write(tmp_path / "run.csv", columns)).episode
-        inner = slice(5, -5)
-        truth = np.column_stack([foreign.speed(t), np.zeros_like(t), foreign.yaw_rate(t)])
-        error = (episode.states[:, 3:] - truth)[inner]
-        # Slope of a least-squares line through W samples at spacing dt: std * sqrt(12 / (W (W^2 - 1))) / dt.
-        width = 3 if rate_hz == 30.0 else 7
-        gain = np.sqrt(12 / (width * (width**2 - 1))) * rate_hz
-        assert np.std(error[:, 0]) < 1.5 * 3e-4 * gain + 0.002
-        assert np.std(error[:, 2]) < 1.5 * 1e-3 * gain + 0.002
-        assert np.abs(error).max() < 0.2
-        # A delayed estimate correlates with the derivative of the true velocity.
-        delay_s = np.dot(error[:, 0], foreign.acceleration(t)[inner]) / np.sum(foreign.acceleration(t)[inner] ** 2)
-        assert abs(delay_s) < 2e-3
-        assert "no delay" in episode.metadata["velocity_source"]
-        assert episode.metadata["velocity_delay_s"] == "0"
 
     def test_throttle_gate_gives_requested_and_sent_throttle(self, clean, tmp_path):
         gate = np.where((EVEN > 10) & (EVEN < 12), 0.0, 1.0)

@@ -172,3 +172,31 @@ def test_fit_of_a_long_column_by_every_kth_row_is_the_same(monkeypatch):
     assert by_every_fifth_row.unexplained == pytest.approx(by_all_rows.unexplained, rel=0.1)
     assert by_every_fifth_row.prediction.shape == t_s.shape
     assert by_every_fifth_row.scale != by_all_rows.scale
+
+
+@pytest.mark.parametrize("rate_hz", [30.0, 100.0])
+def test_velocities_from_a_noisy_pose_have_the_expected_error_and_no_delay(rng, rate_hz, tmp_path):
+    count = int(25.0 * rate_hz)
+    t = (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / rate_hz
+    columns = foreign.drive(t)
+    for name, std in (("x", 3e-4), ("y", 3e-4), ("yaw", 1e-3)):
+        columns[name] = columns[name] + rng.normal(0.0, std, len(t))
+    columns["yaw"] = (columns["yaw"] + np.pi) % (2 * np.pi) - np.pi
+    assert np.sum(np.abs(np.diff(columns["yaw"])) > 5) >= 2
+    for name in ("vx", "vy", "yaw_rate"):
+        del columns[name]
+    episode = import_csv(foreign.write(tmp_path / "run.csv", columns)).episode
+    inner = slice(5, -5)
+    truth = np.column_stack([foreign.speed(t), np.zeros_like(t), foreign.yaw_rate(t)])
+    error = (episode.states[:, 3:] - truth)[inner]
+    # Slope of a least-squares line through W samples at spacing dt: std * sqrt(12 / (W (W^2 - 1))) / dt.
+    width = 3 if rate_hz == 30.0 else 7
+    gain = np.sqrt(12 / (width * (width**2 - 1))) * rate_hz
+    assert np.std(error[:, 0]) < 1.5 * 3e-4 * gain + 0.002
+    assert np.std(error[:, 2]) < 1.5 * 1e-3 * gain + 0.002
+    assert np.abs(error).max() < 0.2
+    # A delayed estimate correlates with the derivative of the true velocity.
+    delay_s = np.dot(error[:, 0], foreign.acceleration(t)[inner]) / np.sum(foreign.acceleration(t)[inner] ** 2)
+    assert abs(delay_s) < 2e-3
+    assert "no delay" in episode.metadata["velocity_source"]
+    assert episode.metadata["velocity_delay_s"] == "0"
