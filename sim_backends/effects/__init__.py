@@ -30,6 +30,7 @@ from sim_backends.effects.curves import CURVES, MeasuredCurve
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
 from sim_backends.effects.disturbances import BODY_FORCE_PARAMETERS, DISTURBANCES, DRIFTING_PARAMETERS, Disturbance
 from sim_backends.effects.drive import (
+    AllWheelDrive,
     BatterySag,
     BrakeAsymmetry,
     DragBrake,
@@ -76,6 +77,7 @@ _ALL: tuple[Effect, ...] = (
     MotorLag(),
     MotorSaturation(),
     TractionLimit(),
+    AllWheelDrive(),
     SpeedController(),
     DragBrake(),
     BrakeAsymmetry(),

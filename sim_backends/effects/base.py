@@ -225,8 +225,8 @@ class Forces:
     wheel_angle [rad], throttle [1], mass [kg], loads of the axles [N], friction coefficients ``grip_front`` and
     ``grip_rear`` [1]. ``front_axle`` and ``rear_axle`` are distances from the centre of mass [m]. ``full_drive`` is the
     car file's motor force at full throttle, ``drive`` the motor's force, ``axle_force`` the F_x of the driven axle
-    (drive less damping), ``demand`` the same before wheel slip, ``force_x`` all longitudinal forces but the tyres' side
-    forces. ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are
+    (drive less damping), ``demand`` the same before wheel slip, ``front_force`` the part of ``axle_force`` at the front
+    wheels, along them (None: rear-wheel drive), ``force_x`` all longitudinal forces but the tyres' side forces. ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are
     the extra states of effects by name; an effect puts their time derivatives into ``rates``. ``stiff`` has, within a
     Runge-Kutta step, the ``StiffStep`` of each effect with stiff states, by effect id.
     """
@@ -253,6 +253,7 @@ class Forces:
     drive: Value = 0.0
     demand: Value = 0.0
     axle_force: Value = 0.0
+    front_force: Value | None = None
     front_per_load: Value = 0.0
     side_front: Value = 0.0
     side_rear: Value = 0.0

@@ -226,6 +226,47 @@ class SpeedController(DynamicsEffect):
         forces.axle_force = limited_by_direction(ops, forces.axle_force, forward, backward, values["roundness"])
 
 
+class AllWheelDrive(DynamicsEffect):
+    """``share`` times the F_x of the driven axles acts at the front wheels, along them.
+
+    With F = share F_x and the wheel angle d, ``force_x += F (cos d - 1)``, ``F_y += F sin d``, ``M += l_f F sin d``.
+    The other effects see one driven axle with all of F_x, except the friction ellipse (each axle has its own). Source:
+    the single-track model with front and rear longitudinal forces, Rajamani 2012, "Vehicle Dynamics and Control",
+    ch. 2.
+    """
+
+    id = "all_wheel_drive"
+    command = "throttle"
+    name = "drive of the front wheels"
+    summary = "The motor drives the front wheels too, so driving and braking turn a steered car."
+    sentence = "{share} of the drive force acts at the front wheels, in the direction of these wheels"
+    refuted_if = "the front wheels stand still while the motor turns on a lifted car"
+    order = 5
+    base_models = ("dynamic", "linear_tyre", "blend")
+    parameters = (EffectParameter("share", "1", 0.0, 0.0, 1.0, 0.3),)
+    confusable = (
+        Confusable(
+            "load_transfer",
+            "throttle_steps",
+            (
+                "driven front wheels turn the car in proportion to the wheel angle; load transfer changes the "
+                "side force in proportion to that force"
+            ),
+        ),
+    )
+
+    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Turn the front's force with its wheels."""
+        forces.force_x = forces.force_x + values["share"] * forces.axle_force * (forces.wheel_cos - 1.0)
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Add the front's force across the car; load transfer and traction do not change the axle force any more."""
+        forces.front_force = values["share"] * forces.axle_force
+        across = forces.front_force * forces.wheel_sin
+        forces.force_y = forces.force_y + across
+        forces.moment = forces.moment + forces.front_axle * across
+
+
 class TractionLimit(DynamicsEffect):
     """``|F_x at the driven axle| <= b`` with ``b = share mu F_z`` of the rear axle, or of both where ``axle`` is "all".
 

@@ -142,8 +142,9 @@ class FrictionEllipse(DynamicsEffect):
     """``F_rear = k F`` (action "scales") or ``clip(F, -k G, k G)`` (action "limits"), F the side force without it.
 
     ``k = sqrt(1 - clip(scale F_x / (mu F_z), -0.98, 0.98)^2)``: the ellipse scales the side force at every slip angle,
-    or only limits it. G is the grip ``mu F_z``, or |F| where that is larger (linear tyres). F_x is that of the driven
-    axle (drive less damping, after a traction limit or wheel slip). Source: the friction ellipse, Pacejka 2012, "Tire
+    or only limits it. G is the grip ``mu F_z``, or |F| where that is larger (linear tyres). F_x is that of the rear
+    axle (drive less damping, after a traction limit or wheel slip). With all-wheel drive, the front axle has the same
+    ellipse with its own F_x. Source: the friction ellipse, Pacejka 2012, "Tire
     and Vehicle Dynamics", ch. 1.
     """
 
@@ -175,13 +176,21 @@ class FrictionEllipse(DynamicsEffect):
     )
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scale or limit the rear's side force."""
-        peak = ops.at_least(forces.grip_rear * forces.load_rear, 1e-6)
-        share = ops.clip(values["scale"] * forces.axle_force / peak, -MAX_SHARE, MAX_SHARE)
-        remaining = ops.sqrt(1.0 - share * share)
-        limit = remaining * ops.at_least(ops.abs(forces.side_rear), peak)
-        limited = ops.clip(forces.side_rear, -limit, limit)
-        forces.side_rear = ops.where(values["action"] < 0.5, remaining * forces.side_rear, limited)
+        """Scale or limit the side force of the driven axles."""
+
+        def remaining(side: Value, grip: Value, force_x: Value) -> Value:
+            share = ops.clip(values["scale"] * force_x / grip, -MAX_SHARE, MAX_SHARE)
+            factor = ops.sqrt(1.0 - share * share)
+            limit = factor * ops.at_least(ops.abs(side), grip)
+            return ops.where(values["action"] < 0.5, factor * side, ops.clip(side, -limit, limit))
+
+        rear_force = forces.axle_force
+        if forces.front_force is not None:
+            rear_force = rear_force - forces.front_force
+            grip_front = ops.at_least(forces.grip_front * forces.load_front, 1e-6)
+            forces.side_front = remaining(forces.side_front, grip_front, forces.front_force)
+        grip_rear = ops.at_least(forces.grip_rear * forces.load_rear, 1e-6)
+        forces.side_rear = remaining(forces.side_rear, grip_rear, rear_force)
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
         """Both actions at several scales."""

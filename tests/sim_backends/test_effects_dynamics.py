@@ -40,6 +40,8 @@ CASES = {
     "friction_drift": {"friction_drift": {"rate": -0.5}},
     "traction_limit_all": {"traction_limit": {"share": 0.5, "axle": "all"}},
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
+    "all_wheel_drive_with_ellipse": {"all_wheel_drive": {"share": 0.6}, "friction_ellipse": {"scale": 0.7}},
+    "all_wheel_drive_with_transfer": {"all_wheel_drive": {"share": 0.5}, "load_transfer": {"height": 0.06}},
     "limited_ellipse": {"friction_ellipse": {"scale": 0.9, "action": "limits"}},
     "torque_with_traction": {
         "torque_steer": {"coefficient": -0.1, "source": "force"},
@@ -209,7 +211,8 @@ def reference_rates(t, s, d, u, p, e):
             )
             limit, shape = q["share"] * grip, 1.0 - q.get("roundness", 0.0)
             force = math.copysign(smaller_root(shape, abs(demand), limit), demand)
-        m_ax = force + body_x - front_each * (z_front - transferred_load) * math.sin(d)
+        at_front = e["all_wheel_drive"]["share"] * force * (math.cos(d) - 1) if has("all_wheel_drive") else 0.0
+        m_ax = force + at_front + body_x - front_each * (z_front - transferred_load) * math.sin(d)
         before, transferred_load = transferred_load, m_ax * height / (a + b)
         if math.isclose(before, transferred_load, rel_tol=1e-13):
             break
@@ -228,11 +231,17 @@ def reference_rates(t, s, d, u, p, e):
         limit = mu_rear * z_rear
         force = limit * math.tanh(q["stiffness"] * (rim - vx) / max(abs(vx), 0.3) / limit)
         rim_rate = RADIUS**2 / q["inertia"] * (demand - force)
+    front_share = e["all_wheel_drive"]["share"] if has("all_wheel_drive") else 0.0
     if has("friction_ellipse"):
-        q, peak = e["friction_ellipse"], mu_rear * z_rear
-        side_share = math.cos(math.asin(min(max(q["scale"] * force / peak, -0.98), 0.98)))
-        limited = math.copysign(min(abs(f_rear), side_share * peak), f_rear)
-        f_rear = limited if q.get("action") == "limits" else side_share * f_rear
+        q = e["friction_ellipse"]
+
+        def beside(side, force_x, peak):
+            side_share = math.cos(math.asin(min(max(q["scale"] * force_x / peak, -0.98), 0.98)))
+            limited = math.copysign(min(abs(side), side_share * peak), side)
+            return limited if q.get("action") == "limits" else side_share * side
+
+        f_rear = beside(f_rear, (1 - front_share) * force, mu_rear * z_rear)
+        f_front = beside(f_front, front_share * force, mu_front * z_front) if front_share else f_front
     if has("torque_steer"):
         q = e["torque_steer"]
         moment += q["coefficient"] * (force / p.drive_gain_n if q.get("source") == "force" else u)
@@ -252,13 +261,15 @@ def reference_rates(t, s, d, u, p, e):
         per_s = max(abs(vx), 0.3) / e["tyre_relaxation"]["length"]
         lag_rates = ((f_front - lag_front) * per_s, (f_rear - lag_rear) * per_s)
         f_front, f_rear = lag_front, lag_rear
+    wheel = np.array([[math.cos(d), -math.sin(d)], [math.sin(d), math.cos(d)]])  # axes of the front wheels, in the body
+    front_along, front_across = wheel @ [front_share * force, f_front]
     return [
         vx * math.cos(yaw) - vy * math.sin(yaw),
         vx * math.sin(yaw) + vy * math.cos(yaw),
         r,
-        (force + body_x - f_front * math.sin(d)) / m + vy * r,
-        (f_rear + f_front * math.cos(d) + body_y) / m - vx * r,
-        (a * f_front * math.cos(d) - b * f_rear + moment) / p.yaw_inertia_kgm2,
+        ((1 - front_share) * force + front_along + body_x) / m + vy * r,
+        (f_rear + front_across + body_y) / m - vx * r,
+        (a * front_across - b * f_rear + moment) / p.yaw_inertia_kgm2,
         *lag_rates,
         rim_rate,
         roll_rate,

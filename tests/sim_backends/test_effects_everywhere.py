@@ -34,6 +34,7 @@ IDS = [
     "motor_lag",
     "motor_saturation",
     "traction_limit",
+    "all_wheel_drive",
     "speed_controller",
     "drag_brake",
     "brake_asymmetry",

@@ -43,6 +43,7 @@ def library(data: Prepared) -> dict[str, Term]:
         "drag_brake": _force(lambda s, v: (-_released(s) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
         "speed_controller": _force(lambda s, v: (_lost_force(s, v), 0.0, 0.0)),
         "cornering_drag": _force(lambda s, v: (-np.abs(_angle(s)) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
+        "all_wheel_drive": _force(lambda s, v: _front_drive(s, v, 0.3)),
         "yaw_damping": _force(lambda s, v: (0.0, 0.0, -0.01 * v[:, 5])),
         "torque_steer": _force(lambda s, v: (0.0, 0.0, 0.01 * _throttle(s))),
         "lateral_bias": _force(lambda s, v: (0.0, np.ones(len(v)), 0.0)),
@@ -149,6 +150,13 @@ def _lost_force(s: Steps, middle: FloatArray) -> FloatArray:
     force = s.car.drive_gain * _throttle(s) - s.car.damping * middle[:, 3]
     largest = float(np.quantile(np.abs(force), 0.99))
     return np.asarray(np.clip(force, -0.6 * largest, 0.8 * largest) - force)
+
+
+def _front_drive(s: Steps, middle: FloatArray, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Change of the forces [N] and of the moment [N m] by a share of the motor's force at the front wheels."""
+    force, angle = share * (s.car.drive_gain * _throttle(s) - s.car.damping * middle[:, 3]), _angle(s)
+    across = force * np.sin(angle)
+    return force * (np.cos(angle) - 1.0), across, s.car.front_axle * across
 
 
 def _combined(s: Steps, scale: float) -> FloatArray:

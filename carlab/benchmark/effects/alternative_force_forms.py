@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, heading, hook, plain, signed
 from carlab.benchmark.effects.force_forms import STICTION_MPS
-from carlab.benchmark.effects.tyre_forms import driven_wheels, other_tyres, placed, saturating, slipping
+from carlab.benchmark.effects.tyre_forms import driven_front, driven_wheels, other_tyres, placed, saturating, slipping
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.physics import Instant, World
 
@@ -93,6 +93,11 @@ def brush_shape(b: float, c: float) -> Callable[[float], float]:
     return shape
 
 
+def one_way(now: Instant, share: float) -> float:
+    """A one-way bearing: the front wheels drive, but do not brake (the end is soft, over 0.2 N)."""
+    return share * 0.5 * (now.fx + math.hypot(now.fx, 0.2))
+
+
 @hook("tyre")
 def combined_slip(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Side force times cos(atan(k)), k = scale F_x / (mu F_z).
@@ -100,7 +105,8 @@ def combined_slip(now: Instant, p: Parameters, car: BaseCar) -> None:
     This is the form of the magic formula's weighting function for combined slip (Pacejka 2012, "Tire and Vehicle
     Dynamics", section 4.3.2), with force in place of slip.
     """
-    now.fr /= math.hypot(1.0, p["scale"] * now.fx / (now.mu_r * now.fz_r))
+    now.fr /= math.hypot(1.0, p["scale"] * (now.fx - now.fx_f) / (now.mu_r * now.fz_r))
+    now.ff /= math.hypot(1.0, p["scale"] * now.fx_f / (now.mu_f * now.fz_f))
 
 
 def slip_relaxation(world: World, p: Parameters) -> None:
@@ -229,6 +235,7 @@ FORMS = (
     Form("aerodynamic_drag", "other", drag_parameters, powered_drag, 0.05, 1.5),
     Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
     Form("tyre_saturation", "other", saturating, other_tyres(brush_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("all_wheel_drive", "other", plain("share"), driven_front(one_way), 0.1, 1.0),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
     Form("longitudinal_slip", "other", slipping, driven_wheels(brush_shape(1.0, 1.0)), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),

@@ -33,6 +33,7 @@ CONFUSABLE: dict[str, tuple[str, ...]] = {
     "motor_lag": ("throttle_delay",),
     "motor_saturation": ("throttle_nonlinearity", "traction_limit"),
     "traction_limit": ("motor_saturation", "friction_ellipse"),
+    "all_wheel_drive": ("friction_ellipse", "load_transfer"),
     "brake_asymmetry": (),
     "battery_sag": ("friction_drift",),
     "rolling_resistance": ("throttle_deadband",),

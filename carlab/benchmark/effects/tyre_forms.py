@@ -40,11 +40,33 @@ def other_tyres(shape: Callable[[float, float], Callable[[float], float]]) -> At
     return attach
 
 
+def driven_front(front_force: Callable[[Instant, float], float]) -> Attach:
+    """A part of F_x acts at the front wheels, along them; ``front_force`` gives it from the instant and the share."""
+
+    def attach(world: World, p: Parameters) -> None:
+        arm = world.car.front_axle
+
+        def pull(now: Instant) -> None:
+            now.push_x += now.fx_f * (now.cos_d - 1.0)
+            now.push_y += now.fx_f * now.sin_d
+            now.moment += arm * now.fx_f * now.sin_d
+
+        def split(now: Instant) -> None:
+            now.fx_f = front_force(now, p["share"])
+
+        world.hooks["tyre"].insert(0, split)
+        world.hooks["body"].append(pull)
+
+    return attach
+
+
 @hook("tyre")
 def friction_ellipse(now: Instant, p: Parameters, car: BaseCar) -> None:
-    """Longitudinal force at the rear axle reduces its side force."""
-    used = min(max(p["scale"] * now.fx / (now.mu_r * now.fz_r), -0.98), 0.98)
-    now.fr *= math.sqrt(1.0 - used * used)
+    """The longitudinal force of an axle reduces its side force."""
+    rear = min(max(p["scale"] * (now.fx - now.fx_f) / (now.mu_r * now.fz_r), -0.98), 0.98)
+    front = min(max(p["scale"] * now.fx_f / (now.mu_f * now.fz_f), -0.98), 0.98)
+    now.fr *= math.sqrt(1.0 - rear * rear)
+    now.ff *= math.sqrt(1.0 - front * front)
 
 
 def driven_wheels(curve: Callable[[float], float]) -> Attach:
@@ -157,6 +179,7 @@ def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 FORMS = (
     Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda now, share: share * now.fx), 0.1, 1.0),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
     Form("longitudinal_slip", "catalogue", slipping, driven_wheels(math.tanh), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),

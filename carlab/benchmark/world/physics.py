@@ -26,8 +26,8 @@ class Instant:
     """All variables at one time; hooks read and change them stage by stage.
 
     Stages: ``steer`` (front wheel angle d), ``throttle`` (u), ``drive`` (drive force), ``load`` (axle loads), ``grip``
-    (mu), ``limit`` (fx, the force at the rear axle), ``tyre`` (lateral axle forces), ``body`` (push_x, push_y [N] in
-    the body frame and moment [N m]). Angles are in rad, velocities in m/s and rad/s, forces and loads in N. Hidden
+    (mu), ``limit`` (fx, the force of the driven axles; fx_f, its part at the front wheels), ``tyre`` (lateral axle
+    forces), ``body`` (push_x, push_y [N] in the body frame and moment [N m]). Angles are in rad, velocities in m/s and rad/s, forces and loads in N. Hidden
     states of hooks are ``extra``, their rates go to ``rates``.
     """
 
@@ -44,6 +44,7 @@ class Instant:
     cos_d: float
     drive: float
     fx: float
+    fx_f: float
     fz_f: float
     fz_r: float
     mu_f: float
@@ -160,7 +161,7 @@ class Derivative:
                 hook(now)
         now.ff = -now.mu_f * now.fz_f * now.shape_f
         now.fr = -now.mu_r * now.fz_r * now.shape_r
-        now.push_x = now.push_y = now.moment = 0.0
+        now.fx_f = now.push_x = now.push_y = now.moment = 0.0
         for stage in (tyre, body):
             for hook in stage:
                 hook(now)
