@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from carlab.core.episode_data import EpisodeData
-from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.support import curve_findings
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import (
@@ -28,7 +25,7 @@ from carlab.diagnosis.final_models import (
     trained_models,
 )
 from carlab.diagnosis.findings import DataFault, Diagnosis, EffectFinding, FigureData, RecordingUse, final_model_name
-from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
+from carlab.diagnosis.identification.held_out_errors import HeldOut, mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.limits import effect_limits
@@ -46,7 +43,7 @@ from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
-from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
+from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
 from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import naming_lost_frames, with_known_latency
 from carlab.diagnosis.uncertain_effects import without_uncertain_effects
@@ -170,21 +167,19 @@ def _prepare_recordings(
         raise
     if request.ceiling or request.discrepancy:
         check_duration(recordings.fit_segments, EnsembleSettings())
-    recordings, noise = _estimate_noise(recordings, nominal, request.settings.identification)
+    recordings, noise = _estimate_noise(recordings, nominal)
     return recordings, noise, faults
 
 
-def _estimate_noise(
-    recordings: SplitRecordings, nominal: SimulatorConfig, settings: IdentificationSettings
-) -> tuple[SplitRecordings, Noise]:
+def _estimate_noise(recordings: SplitRecordings, nominal: SimulatorConfig) -> tuple[SplitRecordings, Noise]:
     """Correct the initial states of the windows, and estimate the noise of the recordings."""
     fit_windows, held_out_windows, event_windows = with_initial_states(
-        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows), nominal, settings
+        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows), nominal
     )
     recordings = replace(
         recordings, fit_windows=fit_windows, held_out_windows=held_out_windows, event_windows=event_windows
     )
-    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias, settings=settings)
+    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias)
 
 
 def _search_effects(
@@ -193,8 +188,7 @@ def _search_effects(
     """Search for effects, withdraw spurious ones, and score the result on held-out windows."""
     control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, request.nominal
-    identification = request.settings.identification
-    floor: FloatArray = np.sqrt(np.mean(noise_floor(windows, noise, nominal, identification)[1:] ** 2, axis=0))
+    floor = mean_noise_floor(windows, noise, nominal)
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
     problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
     start, search_share = SEARCH_PROGRESS
@@ -205,10 +199,10 @@ def _search_effects(
     search_control = replace(control, progress=search_progress)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
-    vibration = find_vibration(recordings.fit_segments, request.settings.unexplained)
+    vibration = find_vibration(recordings.fit_segments)
     if vibration is not None:
-        noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, slowest=True, settings=identification)
-    held_out = HeldOut.of(recordings.held_out_windows, noise, nominal, identification)
+        noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, slowest=True)
+    held_out = HeldOut.of(recordings.held_out_windows, noise, nominal)
     if request.effects is None:
         naming = accept_names(problem, found, held_out, vibration, search_control)
     else:

@@ -131,8 +131,7 @@ def _rival_without_names(
 
 def residual_of(problem: SearchProblem, found: SearchResult, term_chi2_min: float | None = None) -> ResidualModel:
     """Unnamed terms in addition to the accepted effects."""
-    settings = problem.settings.unexplained
-    return fit_residual_terms(problem.windows, found.best, found.scale, term_chi2_min, settings)
+    return fit_residual_terms(problem.windows, found.best, found.scale, term_chi2_min)
 
 
 def _are_spurious(
@@ -178,7 +177,7 @@ def _limits_in_addition(
 def _limits_in_place(problem: SearchProblem, found: SearchResult) -> Alternatives:
     """Conditions on the gain of unnamed terms in place of the accepted effects."""
     gain = _gain_of_effects(problem, found)
-    terms = fit_residual_terms(problem.windows, found.base, found.scale, None, problem.settings.unexplained)
+    terms = fit_residual_terms(problem.windows, found.base, found.scale)
     ratio = terms.gain / gain if gain > 0.0 else np.inf
     is_similar = Condition("rivals.unnamed_ratio", ratio, problem.settings.rivals.unnamed_ratio, above=False)
     return (is_similar,), (_is_irrelevant(problem, found, terms.gain - gain),)
@@ -246,7 +245,6 @@ def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldO
                 np.zeros((len(windows), 0)),
                 held_out.noise.measured,
                 max_error=problem.settings.selection.max_left_out_error,
-                settings=problem.settings.identification,
             )
             total += float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)
         excess.append(max(total, 0.0))

@@ -12,7 +12,6 @@ from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.drift import drift_sentence
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.write import completed
-from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.changing_drives import changing_drive
@@ -27,7 +26,7 @@ def drift_of(fit, held_out, config=CONFIG):
     fit_segments, segments = segments_of(fit), segments_of(held_out)
     windows = cut_windows(segments, 1.0, 0.25)
     noise = estimate_noise(fit_segments, windows.curvature_bias)
-    return adapt_to_held_out(config, fit_segments, segments, HeldOut.of(windows, noise, config), DEFAULT.drift).drift
+    return adapt_to_held_out(config, fit_segments, segments, HeldOut.of(windows, noise, config)).drift
 
 
 @pytest.fixture(scope="module")

@@ -163,7 +163,8 @@ def test_effect_without_gain_on_left_out_blocks_is_eliminated(
     car = load_car_file(drag[0] / "car.toml").simulator
     floor = np.array([0.006, 0.006, 0.005, 0.015, 0.015, 0.04])
     problem = SearchProblem(car, windows, floor, floor, confusable_effects())
-    scale = Scale.of(prediction_errors(simulate_windows(windows, car), windows)[0], floor, 0.2)
+    whole = problem.scale_of(car)
+    scale = replace(whole, sigma=np.maximum(0.2 * whole.sigma, floor))
     named = ("aerodynamic_drag", "steering_asymmetry", "torque_steer")
     base = refit(problem, (), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale)
     remaining = eliminate(problem, refit(problem, named, base.fit, scale), RunControl())

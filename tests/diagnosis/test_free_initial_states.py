@@ -18,7 +18,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.naming import explained_share
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
@@ -70,7 +70,7 @@ def test_loss_is_the_minimum_over_initial_states(simulated: tuple[SimulatorConfi
             return np.stack([(errors_at(shift + step) - errors_at(shift)) / 0.1 for step in 0.1 * np.eye(6)], axis=1)
 
         loss = loss_of_free_initial_states(window, wrong, (), np.zeros((1, 0)), STD, max_error=1e4)[0]
-        delta = DEFAULT.identification.huber_delta
+        delta = IDENTIFICATION.huber_delta
         best = least_squares(errors_at, np.zeros(6), slopes_at, loss="huber", f_scale=delta, ftol=1e-6)
         assert best.cost < 0.5 * huber(errors_at(np.zeros(6))).sum()
         assert loss == pytest.approx(best.cost, rel=0.02)

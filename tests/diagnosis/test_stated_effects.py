@@ -18,7 +18,7 @@ from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
 from carlab.diagnosis.report.write import completed, with_parameter_std
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
@@ -123,7 +123,7 @@ def test_standard_deviation_of_the_car_file_is_that_of_the_prior(nominal: Simula
     name = "motor.drive_gain"
     value = nominal.values()[name]
     known = replace(nominal, parameter_std={name: 0.04 * value})
-    change_share = DEFAULT.identification.prior_change_share
+    change_share = IDENTIFICATION.prior_change_share
     (before,), (after,) = ([f for f in base_parameters(c, uses_std=True) if f.name == name] for c in (nominal, known))
     at_one_std = [float(f.value(np.array(f.prior_z))) for f in (before, after)]
     assert at_one_std[1] == pytest.approx(value * np.exp(np.hypot(0.04, change_share)))

@@ -13,9 +13,6 @@ from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
-from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
 
 log = logging.getLogger(__name__)
@@ -55,7 +52,7 @@ def fit_curves(
     control.progress("fitting measured curves to all windows", 0.6)
     effects = _effects_with(problem, found, curves)
     fit = _fit(problem, (*effects, *curves), _coordinates(fit), settings.iterations, settings.last_iterations)
-    scale = _scale(problem, fit.config)
+    scale = problem.scale_of(fit.config)
     named = _effects_with(problem, found, ())
     reference = _fit(problem, named, _coordinates(found.best), settings.first_iterations, settings.last_iterations)
     losses = [_left_out_loss(problem, each, scale) for each in (reference, fit)]
@@ -86,7 +83,7 @@ def _fit(problem: SearchProblem, effects: tuple[str, ...], start: dict[str, floa
     fit = None
     for count in iterations:
         values = {f.name: float(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
-        scale = _scale(problem, config.with_values(values))
+        scale = problem.scale_of(config.with_values(values))
         fit = problem.fitter(scale).fit(config, free, z, iterations=count, tolerance=problem.settings.curves.tolerance)
         z = fit.z
     assert fit is not None
@@ -102,7 +99,7 @@ def _eliminate(
         The fit with the remaining curves, these curves, and the removed ones.
     """
     settings = problem.settings.curves
-    scale = _scale(problem, fit.config)
+    scale = problem.scale_of(fit.config)
     loss = _left_out_loss(problem, fit, scale)
     rejected: list[RejectedCurves] = []
     for k, name in enumerate(reversed(curves)):
@@ -124,12 +121,6 @@ def _left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray
     """Loss of each window (S,) by a fit without its block."""
     limit = problem.settings.selection.max_left_out_error
     return problem.fitter(scale).leave_fold_out_loss(fit, problem.folds(), limit)
-
-
-def _scale(problem: SearchProblem, config: SimulatorConfig) -> Scale:
-    windows = problem.windows
-    error: FloatArray = prediction_errors(simulate_windows(windows, config), windows)[0]
-    return Scale.of(error, problem.floor, settings=problem.settings.identification)
 
 
 def _coordinates(fit: Fit) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
 
 _MAX_WHITE = 1e4
 
@@ -26,18 +26,13 @@ class Scale:
     root: FloatArray | None = None
 
     @classmethod
-    def of(
-        cls,
-        error: FloatArray,
-        floor: FloatArray,
-        share: float = 1.0,
-        settings: IdentificationSettings = DEFAULT.identification,
-    ) -> Scale:
+    def of(cls, error: FloatArray, floor: FloatArray) -> Scale:
         """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
         last = error.shape[1] - 1
-        steps = np.unique(np.linspace(last / settings.loss_steps, last, settings.loss_steps).round().astype(int))
+        count = IDENTIFICATION.loss_steps
+        steps = np.unique(np.linspace(last / count, last, count).round().astype(int))
         spread = STD_OVER_MAD * np.median(np.abs(error[:, steps]), axis=0)
-        return cls(steps, np.maximum(share * spread, floor))
+        return cls(steps, np.maximum(spread, floor))
 
     def white(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
@@ -60,7 +55,12 @@ def bounded(white: FloatArray) -> FloatArray:
     return np.fmax(np.fmin(white, _MAX_WHITE), -_MAX_WHITE)  # of NaN and a number, these return the number
 
 
-def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
-    """Huber's loss of whitened errors (...), element by element; it is linear from ``delta`` on."""
-    size = np.abs(white)
+def huber(white: FloatArray) -> FloatArray:
+    """Huber's loss of whitened errors (...), element by element; it is linear from ``huber_delta`` on."""
+    delta, size = IDENTIFICATION.huber_delta, np.abs(white)
     return np.where(size <= delta, 0.5 * white**2, delta * size - 0.5 * delta**2)
+
+
+def huber_weight(white: FloatArray) -> FloatArray:
+    """Weight of each whitened error (...) in least squares with the gradient of Huber's loss."""
+    return np.minimum(1.0, IDENTIFICATION.huber_delta / np.maximum(np.abs(white), 1e-12))

@@ -17,7 +17,7 @@ from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.diagnosis.report.residual import explained_share, relevant_residual, shown_errors
 from carlab.diagnosis.report.svg import interval_bar
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DEFAULT, REPORT
 
 
 def render_page(diagnosis: Diagnosis, figure_data: FigureData) -> str:
@@ -58,7 +58,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "explained": explained_share(diagnosis),
         "known": bool(diagnosis.effects) and math.isfinite(explained_share(diagnosis)),
         "driven": bool(figure_data.traces),
-        "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
+        "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: REPORT.max_candidates]],
         "candidate_count": len(figure_data.candidates),
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),

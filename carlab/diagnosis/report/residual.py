@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, final_model_name
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DEFAULT, REPORT
 
 
 def explained_share(diagnosis: Diagnosis, model: str = "with_effects") -> float:
@@ -30,7 +30,7 @@ def shown_errors(diagnosis: Diagnosis) -> dict[str, FitErrors]:
 def is_above_noise(diagnosis: Diagnosis, model: str) -> bool:
     """Whether the score of a model is well above the noise floor."""
     held = diagnosis.held_out.get(model)
-    return held is not None and held.score > DEFAULT.report.score_above_noise
+    return held is not None and held.score > REPORT.score_above_noise
 
 
 def differs_when_held_out(diagnosis: Diagnosis) -> bool:

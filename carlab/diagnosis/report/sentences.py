@@ -19,7 +19,7 @@ from carlab.diagnosis.report.numbers import with_unit as with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, parameters_at_limit, wrong_parameters
 from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DEFAULT, REPORT
 from sim_backends.effects import EFFECTS, Confusable, separation
 from sim_backends.registry import REGISTRY
 
@@ -327,7 +327,7 @@ def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
 
 def _warning_of_fitted(diagnosis: Diagnosis) -> str:
     """A warning if only the fitted recordings have an error well above the noise; else empty."""
-    if is_above_noise(diagnosis, "refit") or not diagnosis.fitted_score > DEFAULT.report.score_above_noise:
+    if is_above_noise(diagnosis, "refit") or not diagnosis.fitted_score > REPORT.score_above_noise:
         return ""
     return (
         f" On the fitted recordings, the error of the refit is {number(diagnosis.fitted_score)} noise floors: they "
