@@ -43,7 +43,7 @@ from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
-from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
+from carlab.diagnosis.settings import DEFAULT, EVIDENCE, DiagnosisSettings
 from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import naming_lost_frames, with_known_latency
 from carlab.diagnosis.uncertain_effects import without_uncertain_effects
@@ -233,7 +233,7 @@ def _assemble_result(
     findings = tuple(_with_texts(finding) for finding in found)
     share = unexplained_share(scored)
     unexplained, described = None, None
-    if share >= request.settings.evidence.unexplained_share_min:
+    if share >= EVIDENCE.unexplained_share_min:
         error = scored.errors["with_effects"]
         unexplained, described = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
@@ -267,7 +267,6 @@ def _assemble_result(
             held_out.windows,
             final_errors[final_model_name(final_errors)],
             final_errors["constant_velocity"],
-            request.settings.evidence,
         ),
         drift=() if adaptation is None else adaptation.drift,
         car_file_parameters=_stated_parameters(request.nominal),

@@ -22,7 +22,7 @@ from carlab.diagnosis.findings import Drift, QuantityChange
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.settings import DRIFT
 from carlab.prediction.adaptation import MIN_FEATURE_STD, AdaptiveModel, DisturbanceSeries, adapt, choose_noise
-from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.adaptation_settings import ADAPTATION
 from carlab.prediction.disturbances import DisturbedModel
 from carlab.prediction.errors import final_errors
 from carlab.prediction.local_error_model import state_features
@@ -69,36 +69,29 @@ def adapt_to_held_out(
         held_out_segments: held-out recordings.
         held_out: windows of the held-out recordings.
     """
-    whole = AdaptationSettings()
     window_s2 = held_out.windows.velocity_window_s2
-    noise = choose_noise(config, fit_segments, whole, velocity_window_s2=window_s2)
-    model = adapt(config, held_out_segments, noise, whole, fitted=fit_segments, velocity_window_s2=window_s2)
-    times_s = tuple(t for t in whole.time_constants_s if t >= DRIFT.min_time_constant_s)
-    slow = replace(whole, time_constants_s=times_s)
+    noise = choose_noise(config, fit_segments, velocity_window_s2=window_s2)
+    model = adapt(config, held_out_segments, noise, fitted=fit_segments, velocity_window_s2=window_s2)
+    slow_s = tuple(t for t in ADAPTATION.time_constants_s if t >= DRIFT.min_time_constant_s)
+
+    def slow(segments: Sequence[RecordingSegment], mask: Mask) -> AdaptiveModel:
+        return adapt(
+            config, segments, noise, time_constants_s=slow_s, drifts=(mask,), with_error_models=False,
+            velocity_window_s2=window_s2,
+        )  # fmt: skip
 
     @cache
     def slowly_adapted(mask: Mask) -> _SlowAdaptation:
-        made = adapt(
-            config,
-            held_out_segments,
-            noise,
-            slow,
-            drifts=(mask,),
-            with_error_models=False,
-            velocity_window_s2=window_s2,
-        )
+        made = slow(held_out_segments, mask)
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
     def along_fitted(mask: Mask) -> FloatArray:
-        fitted = adapt(
-            config, fit_segments, noise, slow, drifts=(mask,), with_error_models=False, velocity_window_s2=window_s2
-        )
-        return fitted.series().mean
+        return slow(fit_segments, mask).series().mean
 
     plain = held_out.final_error(config)
     similar = _similar_states(config, fit_segments, held_out, plain)
-    constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0), slow)
+    constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0))
     errors = {
         "model": plain,
         "adapted": held_out.final_error(model),

@@ -15,7 +15,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_rival import curve_in_addition, replacing_curve
-from carlab.diagnosis.decisions import Alternatives, Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
@@ -149,10 +149,11 @@ def _are_spurious(
     """
     is_additional = rival is not None and rival.names == found.effects
     unnamed_gain = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
-    if not _stand(found, _limits_in_addition(problem, found, unnamed_gain, held_out), control):
+    count = len(found.effects)
+    if not control.effects_stand(found.effects, _limits_in_addition(problem, found, unnamed_gain, held_out), count):
         return True
-    is_small_set = len(found.effects) < problem.settings.rivals.many_effects
-    return is_small_set and not _stand(found, _limits_in_place(problem, found), control)
+    is_small_set = count < problem.settings.rivals.many_effects
+    return is_small_set and not control.effects_stand(found.effects, _limits_in_place(problem, found), count)
 
 
 def _limits_in_addition(
@@ -194,14 +195,6 @@ def _is_irrelevant(problem: SearchProblem, found: SearchResult, gain: float) -> 
     return Condition("rivals.min_unnamed_share", share, problem.settings.rivals.min_unnamed_share, above=False)
 
 
-def _stand(found: SearchResult, alternatives: Alternatives, control: RunControl) -> bool:
-    """Whether all conditions of one alternative hold, so that the accepted effects stand; records the decision."""
-    passed = any(all(c.holds for c in conditions) for conditions in alternatives)
-    for name in found.effects:
-        control.record(Decision("stand", name, alternatives, passed, len(found.effects)))
-    return passed
-
-
 def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
     """Whether held-out score and likelihood are both worse with the effects than with the refit alone."""
     without, with_names = held_out.final_error(found.base.config), held_out.final_error(found.best.config)
@@ -222,7 +215,7 @@ def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldO
     alternatives = tuple(
         (Condition("rivals.min_explained_share", share, settings.min_explained_share),) for share in shares
     )
-    little = not _stand(found, alternatives, control)
+    little = not control.effects_stand(found.effects, alternatives, len(found.effects))
     if little:
         log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), max(shares))
     return little

@@ -17,13 +17,13 @@ from carlab.diagnosis.identification.fit_parameters import (
     effect_parameters,
     with_effect,
 )
-from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from tests.helpers.recorded_drives import drive
 
-PROBLEM = SimpleNamespace(settings=DEFAULT, windows=SimpleNamespace(block=np.arange(20)))
+PROBLEM = SimpleNamespace(windows=SimpleNamespace(block=np.arange(20)))
 EVERY_CASE = [(kind, effect) for kind in ("dynamic", "linear_tyre", "kinematic") for effect in sorted(EFFECTS)]
 
 

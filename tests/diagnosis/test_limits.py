@@ -15,7 +15,7 @@ from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
@@ -64,7 +64,7 @@ def test_limits_agree_with_fits_of_the_effect(
     assert fit.covariance is not None
     for name, limit in limits[effect].items():
         k = [f.name for f in fit.free].index(f"effects.{effect}.{name}")
-        std = DEFAULT.evidence.interval_factor * fit.free[k].size * np.sqrt(fit.covariance[k, k])
+        std = EVIDENCE.interval_factor * fit.free[k].size * np.sqrt(fit.covariance[k, k])
         assert limit.std == pytest.approx(std, rel=0.35)
         assert limit.value == pytest.approx(fit.config.values()[fit.free[k].name], abs=0.5 * std)
         assert limit.low90 <= limit.value <= limit.high90
@@ -73,7 +73,7 @@ def test_limits_agree_with_fits_of_the_effect(
 def test_limits_are_wider_where_the_model_errs(correct: ScoredSearch, limits: dict[str, dict[str, Estimate]]) -> None:
     """By the factors on standard errors; the size at which a slope is taken grows too, so not exactly."""
     std = effect_limits(replace(correct, excess=1.0), FunctionWorkers())["steering_lag"]["time_constant"].std
-    factors = DEFAULT.evidence.model_interval_factor / DEFAULT.evidence.interval_factor
+    factors = EVIDENCE.model_interval_factor / EVIDENCE.interval_factor
     assert std == pytest.approx(factors * limits["steering_lag"]["time_constant"].std, rel=0.1)
     assert factors > 1.2
 

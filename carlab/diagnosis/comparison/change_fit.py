@@ -10,7 +10,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_model import ErrorModel
 from carlab.diagnosis.identification.fit import MAX_STEP, Fitter
-from carlab.diagnosis.identification.fit_parameters import FitParameter
+from carlab.diagnosis.identification.fit_parameters import FitParameter, numbers_at
 from carlab.diagnosis.settings import COMPARISON
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -43,9 +43,7 @@ class ChangeFit:
     @property
     def fitted(self) -> SimulatorConfig:
         """The simulator with the fitted parameters."""
-        return self.config.with_values({
-            f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)
-        })  # fmt: skip
+        return self.config.with_values(numbers_at(self.free, self.z))
 
 
 def fit_change(

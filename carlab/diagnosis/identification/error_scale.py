@@ -9,8 +9,10 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.settings import IDENTIFICATION
+from carlab.prediction.errors import bounded
 
-_MAX_WHITE = 1e4
+MAX_WHITE = 1e4
+"""Maximum size of a whitened error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,19 +42,14 @@ class Scale:
 
     def white_at_steps(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., U, 6) at the steps; none is infinite or NaN."""
-        white = bounded(error / self.sigma)
+        white = bounded(error / self.sigma, MAX_WHITE)
         if self.root is None:
             return white
-        return bounded((white.reshape(*white.shape[:-2], -1) @ self.root).reshape(white.shape))
+        return bounded((white.reshape(*white.shape[:-2], -1) @ self.root).reshape(white.shape), MAX_WHITE)
 
     def as_bytes(self) -> tuple[bytes, ...]:
         """The content, to compare scales by."""
         return tuple(b"" if each is None else each.tobytes() for each in (self.steps, self.sigma, self.root))
-
-
-def bounded(white: FloatArray) -> FloatArray:
-    """Whitened errors (...) of which none is infinite or NaN, as those of a diverged simulation are."""
-    return np.fmax(np.fmin(white, _MAX_WHITE), -_MAX_WHITE)  # of NaN and a number, these return the number
 
 
 def huber(white: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from carlab.diagnosis.identification.bounded_step import (
     inward_steps,
 )
 from carlab.diagnosis.identification.error_scale import Scale, huber, huber_weight
-from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
+from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, numbers_at, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
@@ -69,7 +69,11 @@ class Fit:
 
     def values(self) -> dict[str, float]:
         """Fitted values by dotted name."""
-        return {f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)}
+        return numbers_at(self.free, self.z)
+
+    def coordinates(self) -> dict[str, float]:
+        """Coordinates by dotted name."""
+        return {f.name: float(z) for f, z in zip(self.free, self.z, strict=True)}
 
 
 class _Point(NamedTuple):
@@ -227,7 +231,7 @@ class Fitter:
             smallest = max(tolerance * at.cost, IDENTIFICATION.compared_tolerance * difference)
             if before - at.cost < smallest and at.damping <= MAX_DAMPING_AT_END:
                 break
-        fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, at.z, strict=True)})
+        fitted = config.with_values(numbers_at(free, at.z))
         return Fit(fitted, free, at.z, at.cost, np.asarray(huber(at.white).sum(axis=(1, 2))))
 
     def _lower_point(

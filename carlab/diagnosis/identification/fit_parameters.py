@@ -180,6 +180,11 @@ def difference_steps(free: Sequence[FitParameter]) -> FloatArray:
     return np.array([f.difference_step for f in free])
 
 
+def numbers_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, float]:
+    """Values by dotted name at coordinates z (n,)."""
+    return {f.name: float(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
+
+
 def values_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArray]:
     """Values (1,) by dotted name at coordinates z (n,)."""
     return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}

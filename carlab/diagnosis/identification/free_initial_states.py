@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.error_scale import bounded, huber, huber_weight
+from carlab.diagnosis.identification.error_scale import MAX_WHITE, huber, huber_weight
 from carlab.diagnosis.identification.fit_parameters import FitParameter
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
@@ -87,5 +87,5 @@ def linearised_by_initial_states(
             replace(stacked, initial_states=moved.reshape(-1, 6)), config, values, in_double=True
         )
         error = prediction_errors(predicted.reshape(7, count, -1, 6), windows)[:, :, 1:]
-        white = bounded(error / measured_std).reshape(7, count, -1)
+        white = bounded(error / measured_std, MAX_WHITE).reshape(7, count, -1)
     return white[0], np.moveaxis(white[1:] - white[0], 0, -1)

@@ -26,15 +26,15 @@ from carlab.diagnosis.identification.bounded_step import (
     held_at_bounds,
     inward_steps,
 )
-from carlab.diagnosis.identification.error_scale import bounded, huber
+from carlab.diagnosis.identification.error_scale import MAX_WHITE, huber
 from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter
-from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
+from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, numbers_at
 from carlab.diagnosis.identification.free_initial_states import (
     initial_state_correction,
     linearised_by_initial_states,
 )
 from carlab.diagnosis.settings import IDENTIFICATION
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import IndexArray
 from sim_backends.car_parameters import SimulatorConfig
@@ -159,7 +159,7 @@ def _result(problem: _Problem, point: _Point, precision: FloatArray) -> Fit:
     at = problem.linearised(z, point.states)
     gradient = _normal(at.projected()[0], at)[1] + precision @ z
     covariance = _covariance(at, fitter.windows.block, precision, held_at_bounds(free, z, gradient))
-    config = problem.config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
+    config = problem.config.with_values(numbers_at(free, z))
     loss = fitter.loss(config)
     cost = float(loss.sum() + fitter.prior(free, z[None])[0])
     return Fit(config, free, z, cost, loss, covariance)
@@ -210,7 +210,7 @@ class _Problem:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(stacked, self.config, values, in_double=True).reshape(sets, count, -1, 6)
             white = prediction_errors(predicted, windows)[:, :, 1:] / self.std
-        return bounded(white).reshape(sets, count, -1)
+        return bounded(white, MAX_WHITE).reshape(sets, count, -1)
 
     def linearised(self, z: FloatArray, states: FloatArray) -> _Linearisation:
         """Errors at the best initial states near ``states`` (S, 6), and derivatives."""

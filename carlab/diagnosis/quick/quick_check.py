@@ -26,7 +26,7 @@ from carlab.diagnosis.quick.conditions import ErrorCondition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
 from carlab.diagnosis.settings import QUICK
 from carlab.diagnosis.state_alignment import align_states, lost_frames, window_variance_s2, with_known_latency
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
@@ -150,8 +150,7 @@ def _checked(
 ) -> QuickCheck:
     """Check windows with their noise floor (K + 1, 6)."""
     last = prediction_errors(simulate_windows(windows, simulator), windows)[0, :, -1]
-    limit = QUICK.max_error
-    final = np.nan_to_num(last / floor[-1], nan=limit).clip(-limit, limit)
+    final = bounded(last / floor[-1], QUICK.max_error)
     score, score_std = _score(final, windows)
     channels = _channels(final, floor[-1])
     scored = replace(undecided, score=score, score_std=score_std, channels=channels, windows=len(windows))

@@ -17,7 +17,7 @@ from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.diagnosis.report.residual import explained_share, relevant_residual, shown_errors
 from carlab.diagnosis.report.svg import interval_bar
-from carlab.diagnosis.settings import DEFAULT, REPORT
+from carlab.diagnosis.settings import EVIDENCE, REPORT
 
 
 def render_page(diagnosis: Diagnosis, figure_data: FigureData) -> str:
@@ -63,7 +63,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),
-        "min_windows": DEFAULT.evidence.skill_windows_min,
+        "min_windows": EVIDENCE.skill_windows_min,
         "drift": [(d, figures.drift_charts(d)) for d in diagnosis.drift],
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),

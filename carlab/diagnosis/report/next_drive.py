@@ -7,7 +7,7 @@ from carlab.diagnosis.findings import Diagnosis
 from carlab.diagnosis.report.numbers import listed
 from carlab.diagnosis.report.residual import differs_when_held_out, relevant_residual, remaining_share
 from carlab.diagnosis.report.sentences import effect_noun, separating_drive, separating_reason
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE
 
 
 def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
@@ -37,7 +37,7 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
         cut_short = "without a stop" if search.stopped_by == "user" else "with a longer time limit"
         how = "without --effects" if search.effects else cut_short
         return "", f"Diagnose these recordings again {how}, before another drive."
-    is_described = remaining_share(diagnosis) < DEFAULT.evidence.unexplained_share_min
+    is_described = remaining_share(diagnosis) < EVIDENCE.unexplained_share_min
     if rest is not None and not is_described:
         channels = rest.channels
         along = bool(channels) and channels[0] in ("x", "vx")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.decisions import Alternatives, Decision, passes
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
@@ -203,6 +203,13 @@ class RunControl:
     omit: Callable[[str], None] = lambda stage: None
     ends_search: Callable[[], bool] = lambda: False
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
+
+    def effects_stand(self, effects: Sequence[str], alternatives: Alternatives, count: int) -> bool:
+        """Whether accepted effects, of ``count``, stand together; records the decision about each of them."""
+        stand = passes(alternatives)
+        for name in effects:
+            self.record(Decision("stand", name, alternatives, stand, count))
+        return stand
 
 
 def numbers_of(effect: str) -> list[EffectParameter]:

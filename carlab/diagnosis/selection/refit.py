@@ -56,7 +56,7 @@ def refit_without_each(
 
 def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> FloatArray:
     """Coordinates of a fit with ``effects`` at the values of ``initial``; 0 without a value."""
-    known = {f.name: float(z) for f, z in zip(initial.free, initial.z, strict=True)}
+    known = initial.coordinates()
     return np.array([known.get(f.name, 0.0) for f in problem.free_parameters(effects)])
 
 

@@ -27,7 +27,6 @@ class DiagnosisSettings:
     curves: CurveSettings = field(default_factory=CurveSettings)
     selection: SelectionSettings = field(default_factory=SelectionSettings)
     rivals: RivalSettings = field(default_factory=RivalSettings)
-    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
 
 
 DEFAULT = DiagnosisSettings()
@@ -36,6 +35,7 @@ DEFAULT = DiagnosisSettings()
 COMPARISON = ComparisonSettings()
 DRIFT = DriftSettings()
 EVENTS = EventSettings()
+EVIDENCE = EvidenceSettings()
 IDENTIFICATION = IdentificationSettings()
 QUICK = QuickSettings()
 REPORT = ReportSettings()
@@ -48,6 +48,7 @@ __all__ = [
     "DEFAULT",
     "DRIFT",
     "EVENTS",
+    "EVIDENCE",
     "IDENTIFICATION",
     "QUICK",
     "REPORT",
@@ -55,7 +56,6 @@ __all__ = [
     "UNEXPLAINED",
     "CurveSettings",
     "DiagnosisSettings",
-    "EvidenceSettings",
     "ScreeningSettings",
     "SelectionSettings",
     "WindowSettings",
