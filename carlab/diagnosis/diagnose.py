@@ -24,7 +24,7 @@ from carlab.diagnosis.final_models import (
     measured_curves,
     trained_models,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, EffectFinding, FigureData, RecordingUse, final_model_name
+from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, final_model_name
 from carlab.diagnosis.identification.held_out_errors import HeldOut, mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -39,7 +39,7 @@ from carlab.diagnosis.naming import (
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.figure_data import figure_data_of
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.report.next_drive import with_texts
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -132,9 +132,9 @@ def diagnose(
 
 
 def _with_run(outcome: Outcome, timer: SearchTimer, effects: Sequence[str], decisions: Sequence[Decision]) -> Outcome:
-    """The outcome with run time, and extent and decisions of the search, restricted to ``effects`` if there are any."""
+    """The outcome with texts, run time, and extent and decisions of the search among ``effects`` (empty: all)."""
     extent = replace(timer.extent(), effects=tuple(effects))
-    diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent)
+    diagnosis = with_texts(replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent))
     return replace(outcome, diagnosis=diagnosis, figure_data=replace(outcome.figure_data, decisions=tuple(decisions)))
 
 
@@ -217,20 +217,12 @@ def _search_effects(
     return scored, naming
 
 
-def _with_texts(finding: EffectFinding) -> EffectFinding:
-    """The finding with its sentence, and with the manoeuvre that separates it from its indistinguishable effects."""
-    others = finding.indistinguishable_from
-    sentence = effect_sentence(finding.id, finding.parameters, finding.car_file_values)
-    return replace(finding, sentence=sentence, separating_drive=separating_drive(finding.id, others) if others else "")
-
-
 def _assemble_result(
     scored: ScoredSearch, naming: NamingResult, recordings: SplitRecordings, request: Request, control: RunControl
 ) -> Outcome:
     """Compute evidence, unexplained residual, measured curves, ceiling, verdict and figure data."""
     held_out, progress = scored.held_out, control.progress
-    found = effect_findings(scored, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share))
-    findings = tuple(_with_texts(finding) for finding in found)
+    findings = effect_findings(scored, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share))
     share = unexplained_share(scored)
     unexplained, described = None, None
     if share >= EVIDENCE.unexplained_share_min:

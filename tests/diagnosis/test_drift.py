@@ -11,7 +11,6 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.drift import drift_sentence
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.write import completed
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.changing_drives import changing_drive
@@ -85,7 +84,7 @@ def test_diagnosis_states_the_drift_in_its_report(fitted):
     errors = outcome.diagnosis.held_out
     assert errors["adapted"].position_m < 0.4 * errors["refit"].position_m
     assert outcome.figure_data.noise.adaptation is not None
-    report = completed(outcome.diagnosis)
+    report = outcome.diagnosis
     assert "In held-out recording 1 the car differs from the fitted recordings. The drive force is" in report.sentence
     (table,) = report.to_dict()["drift"]
     assert table["changes"][0]["value"] == pytest.approx(-0.3, abs=0.04)

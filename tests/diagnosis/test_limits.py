@@ -21,7 +21,7 @@ from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
 from sim_backends.effects import CATALOGUE
-from tests.diagnosis.report_material import no_mismatch
+from tests.diagnosis.report_material import changed, no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
@@ -111,7 +111,7 @@ def test_effects_without_a_linear_estimate_are_omitted(limits: dict[str, dict[st
 
 
 def test_report_states_the_narrowest_limits(limits: dict[str, dict[str, Estimate]]) -> None:
-    diagnosis = replace(no_mismatch(), sentence="", limits=limits)
+    diagnosis = changed(no_mismatch(), limits=limits)
     sentence = verdict_sentence(diagnosis)
     assert "for example" not in verdict_sentence(replace(diagnosis, limits={}))
     typical = {e: CATALOGUE[e].parameters[0].typical for e, own in limits.items() if len(own) == 1}

@@ -28,7 +28,7 @@ from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
 from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter
-from tests.diagnosis.report_material import no_mismatch
+from tests.diagnosis.report_material import changed, no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
@@ -226,7 +226,7 @@ def test_curve_that_the_recordings_do_not_need_is_rejected_with_its_test():
     ],
 )
 def test_report_states_why_curves_are_not_accepted(trial, expected):
-    without = replace(no_mismatch(), sentence="", curve_trial=trial)
+    without = changed(no_mismatch(), curve_trial=trial)
     assert curve_sentences(without) == [expected]
     page = render_page(without, FigureData())
     assert expected.replace("'", "&#39;") in page

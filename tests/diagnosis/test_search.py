@@ -17,7 +17,6 @@ from carlab.core.errors import ConfigError
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.findings import SearchExtent
 from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.forward import Path as SelectionPath
@@ -155,7 +154,7 @@ def test_time_limit_ends_the_search_with_a_valid_report(drag: Case, tmp_path: Pa
     assert outcome.diagnosis.effects == ()
     held_out = outcome.diagnosis.held_out
     assert held_out["refit"].score < held_out["nominal"].score
-    assert "cut short by the time limit of 0.001 s" in completed(outcome.diagnosis).sentence
+    assert "cut short by the time limit of 0.001 s" in outcome.diagnosis.sentence
     extent = {"is_complete": False, "stopped_by": "budget", "budget_s": 1e-3, "effects": [], "omitted": []}
     assert outcome.diagnosis.to_dict()["search"] == extent
 

@@ -14,8 +14,9 @@ from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, E
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.report.next_drive import with_texts
 from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
-from carlab.diagnosis.report.write import completed, with_parameter_std
+from carlab.diagnosis.report.write import with_parameter_std
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION
@@ -82,7 +83,7 @@ def test_wrong_number_of_a_stated_effect_is_named(case: Case, tmp_path: Path, no
     assert effect.sentence.startswith("Wrong in the car file: ")
     assert effect.sentence.endswith("not 0.02 rad.")
     assert outcome.model.effects[MISALIGNMENT]["angle"] == effect.parameters["angle"].value
-    report = completed(outcome.diagnosis).to_dict()
+    report = outcome.diagnosis.to_dict()
     assert report["effects"][0]["car_file_values"] == {"angle": 0.02}
     assert report["sentence"].startswith("One effect of the car file has wrong numbers: ")
     assert " With corrected numbers, the position error " in report["sentence"]
@@ -241,6 +242,6 @@ def test_sentence_counts_missing_and_wrong_effects_apart() -> None:
         "The simulator leaves out one effect: a lag of the steering servo. "
         "One effect of the car file has wrong numbers: a lag of the motor."
     )
-    assert completed(diagnosis).effects[1].sentence == (
+    assert with_texts(diagnosis).effects[1].sentence == (
         "Wrong in the car file: a lag of the motor: time_constant is 0.11 s (0.1 to 0.12 at 90 %), not 0.05 s."
     )

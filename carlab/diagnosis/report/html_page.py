@@ -44,7 +44,8 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
     return {
         "d": diagnosis,
         "title": text.verdict_title(diagnosis),
-        "sentence": diagnosis.sentence if _has_own_sentence(diagnosis) else text.verdict_sentence(diagnosis),
+        # That of an inconclusive diagnosis is a reason, not a verdict.
+        "sentence": text.verdict_sentence(diagnosis) if diagnosis.verdict == "inconclusive" else diagnosis.sentence,
         "cards": _cards(diagnosis),
         "effects": [_effect(effect, figure_data) for effect in diagnosis.effects],
         "overlay": figures.overlay(*worst, diagnosis.effects) if worst else [],
@@ -86,11 +87,6 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
     }
 
 
-def _has_own_sentence(diagnosis: Diagnosis) -> bool:
-    """Whether the diagnosis has a verdict sentence; that of an inconclusive one is a reason, not a verdict."""
-    return bool(diagnosis.sentence) and diagnosis.verdict != "inconclusive"
-
-
 def _bar(e: Estimate) -> Any:
     return interval_bar(e.value, e.low90, e.high90)
 
@@ -113,14 +109,11 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     if where.place is not None:
         x, y, radius = (text.with_unit(v, "m") for v in where.place)
         places.append(f"within {radius} of x = {x}, y = {y}")
-    drive = ""
-    if effect.indistinguishable_from:
-        drive = effect.separating_drive or text.separating_drive(effect.id, effect.indistinguishable_from)
     noun = text.effect_noun(effect.id)
     return {
         "id": effect.id,
         "noun": noun[0].upper() + noun[1:],
-        "sentence": effect.sentence or text.effect_sentence(effect.id, effect.parameters, effect.car_file_values),
+        "sentence": effect.sentence,
         "confidence": effect.confidence,
         "confidence_text": text.confidence_text(effect.confidence, len(effect.indistinguishable_from)),
         "where": ", ".join(places),
@@ -128,7 +121,7 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
         "evidence_texts": _evidence_texts(effect),
         "parameters": [(name, e, _bar(e)) for name, e in effect.parameters.items()],
         "others": [(other, text.effect_noun(other)) for other in effect.indistinguishable_from],
-        "drive": drive_command(drive),
+        "drive": drive_command(effect.separating_drive),
         "reason": text.separating_reason(effect.id, effect.indistinguishable_from)
         if effect.indistinguishable_from
         else "",
