@@ -230,7 +230,6 @@ def _diagnosed(
     from carlab.diagnosis.diagnose import diagnose as search
     from carlab.diagnosis.findings import Diagnosis, FigureData
     from carlab.diagnosis.recordings import Inconclusive
-    from carlab.diagnosis.report.write import completed
 
     uses, faults = (*fit.uses, *validation.uses), (*fit.faults, *validation.faults)
     try:
@@ -255,16 +254,15 @@ def _diagnosed(
         return DiagnosisReport(undecided, FigureData(), _as_car_file(undecided, file.simulator, file.name), False)
     model = _as_car_file(outcome.diagnosis, outcome.model, file.name, outcome.figure_data.noise)
     names = tuple(validation.names or fit.names)
-    return DiagnosisReport(completed(outcome.diagnosis), outcome.figure_data, model, True, outcome, names)
+    return DiagnosisReport(outcome.diagnosis, outcome.figure_data, model, True, outcome, names)
 
 
 def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: RecordingNoise | None = None) -> CarFile:
     from carlab.cars import CarFile
-    from carlab.diagnosis.report.write import completed, model_toml, with_parameter_std
+    from carlab.diagnosis.report.write import model_toml, with_parameter_std
 
-    worded = completed(diagnosis)
-    text = model_toml(worded, simulator, noise)
-    return CarFile(f"{name} (diagnosed)", text, with_parameter_std(worded, simulator), None, noise)
+    text = model_toml(diagnosis, simulator, noise)
+    return CarFile(f"{name} (diagnosed)", text, with_parameter_std(diagnosis, simulator), None, noise)
 
 
 def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike]) -> None:

@@ -32,6 +32,11 @@ Alternatives = tuple[tuple[Condition, ...], ...]
 """Alternative sets of conditions; an effect passes if all conditions of one set hold."""
 
 
+def passes(alternatives: Alternatives) -> bool:
+    """Whether all conditions of one of the alternatives hold."""
+    return any(all(condition.holds for condition in conditions) for conditions in alternatives)
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
     """Whether an effect passed a stage: all conditions of one of the alternatives must hold.

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from carlab.core.episode_data import EpisodeData
-from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.support import curve_findings
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import (
@@ -27,8 +24,8 @@ from carlab.diagnosis.final_models import (
     measured_curves,
     trained_models,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, EffectFinding, FigureData, RecordingUse, final_model_name
-from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
+from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, final_model_name
+from carlab.diagnosis.identification.held_out_errors import HeldOut, mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.limits import effect_limits
@@ -42,11 +39,11 @@ from carlab.diagnosis.naming import (
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.figure_data import figure_data_of
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.report.next_drive import with_texts
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
-from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
+from carlab.diagnosis.settings import DEFAULT, EVIDENCE, DiagnosisSettings
 from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import naming_lost_frames, with_known_latency
 from carlab.diagnosis.uncertain_effects import without_uncertain_effects
@@ -135,9 +132,9 @@ def diagnose(
 
 
 def _with_run(outcome: Outcome, timer: SearchTimer, effects: Sequence[str], decisions: Sequence[Decision]) -> Outcome:
-    """The outcome with run time, and extent and decisions of the search, restricted to ``effects`` if there are any."""
+    """The outcome with texts, run time, and extent and decisions of the search among ``effects`` (empty: all)."""
     extent = replace(timer.extent(), effects=tuple(effects))
-    diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent)
+    diagnosis = with_texts(replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent))
     return replace(outcome, diagnosis=diagnosis, figure_data=replace(outcome.figure_data, decisions=tuple(decisions)))
 
 
@@ -170,21 +167,19 @@ def _prepare_recordings(
         raise
     if request.ceiling or request.discrepancy:
         check_duration(recordings.fit_segments, EnsembleSettings())
-    recordings, noise = _estimate_noise(recordings, nominal, request.settings.identification)
+    recordings, noise = _estimate_noise(recordings, nominal)
     return recordings, noise, faults
 
 
-def _estimate_noise(
-    recordings: SplitRecordings, nominal: SimulatorConfig, settings: IdentificationSettings
-) -> tuple[SplitRecordings, Noise]:
+def _estimate_noise(recordings: SplitRecordings, nominal: SimulatorConfig) -> tuple[SplitRecordings, Noise]:
     """Correct the initial states of the windows, and estimate the noise of the recordings."""
     fit_windows, held_out_windows, event_windows = with_initial_states(
-        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows), nominal, settings
+        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows), nominal
     )
     recordings = replace(
         recordings, fit_windows=fit_windows, held_out_windows=held_out_windows, event_windows=event_windows
     )
-    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias, settings=settings)
+    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias)
 
 
 def _search_effects(
@@ -193,8 +188,7 @@ def _search_effects(
     """Search for effects, withdraw spurious ones, and score the result on held-out windows."""
     control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, request.nominal
-    identification = request.settings.identification
-    floor: FloatArray = np.sqrt(np.mean(noise_floor(windows, noise, nominal, identification)[1:] ** 2, axis=0))
+    floor = mean_noise_floor(windows, noise, nominal)
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
     problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
     start, search_share = SEARCH_PROGRESS
@@ -205,10 +199,10 @@ def _search_effects(
     search_control = replace(control, progress=search_progress)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
-    vibration = find_vibration(recordings.fit_segments, request.settings.unexplained)
+    vibration = find_vibration(recordings.fit_segments)
     if vibration is not None:
-        noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, slowest=True, settings=identification)
-    held_out = HeldOut.of(recordings.held_out_windows, noise, nominal, identification)
+        noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, slowest=True)
+    held_out = HeldOut.of(recordings.held_out_windows, noise, nominal)
     if request.effects is None:
         naming = accept_names(problem, found, held_out, vibration, search_control)
     else:
@@ -223,23 +217,15 @@ def _search_effects(
     return scored, naming
 
 
-def _with_texts(finding: EffectFinding) -> EffectFinding:
-    """The finding with its sentence, and with the manoeuvre that separates it from its indistinguishable effects."""
-    others = finding.indistinguishable_from
-    sentence = effect_sentence(finding.id, finding.parameters, finding.car_file_values)
-    return replace(finding, sentence=sentence, separating_drive=separating_drive(finding.id, others) if others else "")
-
-
 def _assemble_result(
     scored: ScoredSearch, naming: NamingResult, recordings: SplitRecordings, request: Request, control: RunControl
 ) -> Outcome:
     """Compute evidence, unexplained residual, measured curves, ceiling, verdict and figure data."""
     held_out, progress = scored.held_out, control.progress
-    found = effect_findings(scored, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share))
-    findings = tuple(_with_texts(finding) for finding in found)
+    findings = effect_findings(scored, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share))
     share = unexplained_share(scored)
     unexplained, described = None, None
-    if share >= request.settings.evidence.unexplained_share_min:
+    if share >= EVIDENCE.unexplained_share_min:
         error = scored.errors["with_effects"]
         unexplained, described = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
@@ -273,7 +259,6 @@ def _assemble_result(
             held_out.windows,
             final_errors[final_model_name(final_errors)],
             final_errors["constant_velocity"],
-            request.settings.evidence,
         ),
         drift=() if adaptation is None else adaptation.drift,
         car_file_parameters=_stated_parameters(request.nominal),

@@ -20,9 +20,9 @@ from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import AdaptationNoise
 from carlab.diagnosis.findings import Drift, QuantityChange
 from carlab.diagnosis.identification.held_out_errors import HeldOut
-from carlab.diagnosis.settings import DEFAULT, DriftSettings
+from carlab.diagnosis.settings import DRIFT
 from carlab.prediction.adaptation import MIN_FEATURE_STD, AdaptiveModel, DisturbanceSeries, adapt, choose_noise
-from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.adaptation_settings import ADAPTATION
 from carlab.prediction.disturbances import DisturbedModel
 from carlab.prediction.errors import final_errors
 from carlab.prediction.local_error_model import state_features
@@ -60,7 +60,6 @@ def adapt_to_held_out(
     fit_segments: Sequence[RecordingSegment],
     held_out_segments: Sequence[RecordingSegment],
     held_out: HeldOut,
-    settings: DriftSettings,
 ) -> Adaptation:
     """Adapt a simulator along held-out recordings, and find what changed in the car since the fitted ones.
 
@@ -69,38 +68,30 @@ def adapt_to_held_out(
         fit_segments: fitted recordings; the noise of the filter is chosen on them.
         held_out_segments: held-out recordings.
         held_out: windows of the held-out recordings.
-        settings: conditions of a drift.
     """
-    whole = AdaptationSettings()
     window_s2 = held_out.windows.velocity_window_s2
-    noise = choose_noise(config, fit_segments, whole, velocity_window_s2=window_s2)
-    model = adapt(config, held_out_segments, noise, whole, fitted=fit_segments, velocity_window_s2=window_s2)
-    times_s = tuple(t for t in whole.time_constants_s if t >= settings.min_time_constant_s)
-    slow = replace(whole, time_constants_s=times_s)
+    noise = choose_noise(config, fit_segments, velocity_window_s2=window_s2)
+    model = adapt(config, held_out_segments, noise, fitted=fit_segments, velocity_window_s2=window_s2)
+    slow_s = tuple(t for t in ADAPTATION.time_constants_s if t >= DRIFT.min_time_constant_s)
+
+    def slow(segments: Sequence[RecordingSegment], mask: Mask) -> AdaptiveModel:
+        return adapt(
+            config, segments, noise, time_constants_s=slow_s, drifts=(mask,), with_error_models=False,
+            velocity_window_s2=window_s2,
+        )  # fmt: skip
 
     @cache
     def slowly_adapted(mask: Mask) -> _SlowAdaptation:
-        made = adapt(
-            config,
-            held_out_segments,
-            noise,
-            slow,
-            drifts=(mask,),
-            with_error_models=False,
-            velocity_window_s2=window_s2,
-        )
+        made = slow(held_out_segments, mask)
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
     def along_fitted(mask: Mask) -> FloatArray:
-        fitted = adapt(
-            config, fit_segments, noise, slow, drifts=(mask,), with_error_models=False, velocity_window_s2=window_s2
-        )
-        return fitted.series().mean
+        return slow(fit_segments, mask).series().mean
 
     plain = held_out.final_error(config)
-    similar = _similar_states(config, fit_segments, held_out, plain, settings)
-    constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0), slow)
+    similar = _similar_states(config, fit_segments, held_out, plain)
+    constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0))
     errors = {
         "model": plain,
         "adapted": held_out.final_error(model),
@@ -109,7 +100,7 @@ def adapt_to_held_out(
     }
     found = [
         replace(
-            _drift_of(number, held_out, errors, slowly_adapted, along_fitted, model.series(), settings),
+            _drift_of(number, held_out, errors, slowly_adapted, along_fitted, model.series()),
             similar_share=float(np.mean(similar.is_similar[held_out.windows.recording == number])),
         )
         for number in np.unique(held_out.windows.recording)
@@ -124,7 +115,6 @@ def _drift_of(
     slowly_adapted: Callable[[Mask], _SlowAdaptation],
     along_fitted: Callable[[Mask], FloatArray],
     series: DisturbanceSeries,
-    settings: DriftSettings,
 ) -> Drift:
     """The drift of one recording, without its share of similar states.
 
@@ -137,18 +127,17 @@ def _drift_of(
         slowly_adapted: slow adaptation of some quantities.
         along_fitted: estimates (N, n) of some quantities along the fitted recordings.
         series: estimates of the adapted prediction.
-        settings: conditions of a drift.
     """
     own = held_out.windows.recording == number
     held_out_part = replace(held_out, windows=held_out.windows.take(own))
     slow = slowly_adapted(EVERYTHING)
-    gains = [_gain_z(held_out_part, errors[name][own], slow.errors[own], settings) for name in BASELINES]
-    is_drift = min(gains) >= settings.gain_z_min
+    gains = [_gain_z(held_out_part, errors[name][own], slow.errors[own]) for name in BASELINES]
+    is_drift = min(gains) >= DRIFT.gain_z_min
     changes: tuple[QuantityChange, ...] = ()
-    if is_drift and any(mask := _changed(held_out_part, own, errors["model"], slowly_adapted, settings)):
-        changes = _changes(slowly_adapted(mask).model.series(), number, mask, along_fitted(mask), settings)
+    if is_drift and any(mask := _changed(held_out_part, own, errors["model"], slowly_adapted)):
+        changes = _changes(slowly_adapted(mask).model.series(), number, mask, along_fitted(mask))
     shown = np.flatnonzero(series.recording == number)
-    shown = shown[:: max(1, -(-len(shown) // settings.series_points))]
+    shown = shown[:: max(1, -(-len(shown) // DRIFT.series_points))]
     return Drift(
         recording=int(number) + 1,
         is_drift=is_drift,
@@ -166,9 +155,9 @@ def _drift_of(
     )
 
 
-def _gain_z(held_out_part: HeldOut, before: FloatArray, after: FloatArray, settings: DriftSettings) -> float:
+def _gain_z(held_out_part: HeldOut, before: FloatArray, after: FloatArray) -> float:
     """Gain from errors ``before`` to ``after`` (S, 6) [clustered standard errors]; 0 with too few blocks."""
-    if len(np.unique(held_out_part.windows.block)) < settings.min_blocks:
+    if len(np.unique(held_out_part.windows.block)) < DRIFT.min_blocks:
         return 0.0
     gain, error = held_out_part.gain(before, after)
     return gain / error
@@ -179,7 +168,6 @@ def _changed(
     own: NDArray[np.bool_],
     plain: FloatArray,
     slowly_adapted: Callable[[Mask], _SlowAdaptation],
-    settings: DriftSettings,
 ) -> Mask:
     """Which quantities changed: forward selection by the gain on held-out windows."""
     mask: Mask = (False,) * len(QUANTITIES)
@@ -189,7 +177,7 @@ def _changed(
         gains = [held_out_part.gain(current, slowly_adapted(each).errors[own]) for each in larger]
         best = int(np.argmax([gain for gain, _ in gains]))
         gain, error = gains[best]
-        if gain < settings.gain_z_min * error:
+        if gain < DRIFT.gain_z_min * error:
             break
         mask = larger[best]
         current = slowly_adapted(mask).errors[own]
@@ -197,12 +185,12 @@ def _changed(
 
 
 def _changes(
-    series: DisturbanceSeries, number: int, mask: Mask, along_fitted: FloatArray, settings: DriftSettings
+    series: DisturbanceSeries, number: int, mask: Mask, along_fitted: FloatArray
 ) -> tuple[QuantityChange, ...]:
     """Significant changes of the quantities in ``mask`` from the fitted recordings, most significant first."""
     own = series.recording == number
     mean, std = series.mean[own], series.std[own]
-    first, last = _ends(series.t_s[own], settings)
+    first, last = _ends(series.t_s[own])
     found = []
     for k in np.flatnonzero(mask):  # the first estimates are near 0, the prior mean
         before = float(along_fitted[:, k].mean())
@@ -210,14 +198,14 @@ def _changes(
         spread = float(np.sqrt(np.mean(std[~first, k] ** 2) + np.var(along_fitted[:, k])))
         ends = float(mean[first, k].mean()) - before, float(mean[last, k].mean()) - before
         found.append(QuantityChange(*QUANTITIES[k], value, spread, *ends))
-    kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= settings.change_z_min * c.std]
+    kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= DRIFT.change_z_min * c.std]
     return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
 
 
-def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.drift) -> tuple[QuantityChange, ...]:
+def changes_along(series: DisturbanceSeries) -> tuple[QuantityChange, ...]:
     """All quantities along one recording or several, whether significant or not."""
     t_s = series.t_s
-    first, last = _ends(t_s, settings)
+    first, last = _ends(t_s)
     return tuple(
         QuantityChange(
             name,
@@ -231,10 +219,10 @@ def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.d
     )
 
 
-def _ends(t_s: FloatArray, settings: DriftSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _ends(t_s: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Rows in the first and in the last share of a recording."""
     start_s, end_s = float(t_s.min()), float(t_s.max())
-    part_s = settings.ends_share * (end_s - start_s)
+    part_s = DRIFT.ends_share * (end_s - start_s)
     return t_s <= start_s + part_s, t_s >= end_s - part_s
 
 
@@ -265,18 +253,17 @@ def _similar_states(
     fit_segments: Sequence[RecordingSegment],
     held_out: HeldOut,
     errors: FloatArray,
-    settings: DriftSettings,
 ) -> _SimilarStates:
     windows = held_out.windows
-    fitted = cut_windows(fit_segments, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
+    fitted = cut_windows(fit_segments, windows.horizon_s, DRIFT.fit_stride_s).thinned(DRIFT.max_fit_windows)
     fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
     fit_errors = final_errors(SimulatorModel(config), fitted)
     fit_states, states = state_features(fitted), state_features(windows)
     scale = np.maximum(fit_states.std(axis=0), MIN_FEATURE_STD)
-    count = min(settings.neighbours, len(fitted))
+    count = min(DRIFT.neighbours, len(fitted))
     distance, index = cKDTree(fit_states / scale).query(states / scale, k=count)
     mean = fit_errors[index.reshape(len(windows), count)].mean(axis=1)
     other_block = fitted.block[:, None] != fitted.block
     between = np.where(other_block, cdist(fit_states / scale, fit_states / scale), np.inf).min(axis=1)
-    limit = np.quantile(between, settings.similar_quantile)
+    limit = np.quantile(between, DRIFT.similar_quantile)
     return _SimilarStates(errors - mean, distance.reshape(len(windows), count)[:, 0] <= limit)

@@ -17,7 +17,7 @@ from scipy.signal import savgol_filter
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.settings import DEFAULT, EventSettings
+from carlab.diagnosis.settings import EVENTS
 from carlab.prediction.windows import EVENT_COLUMN, body_states, unbroken_rows
 from carlab.recording.faults.robust import robust_std, runs
 from carlab.recording.pose_velocity import BoolArray
@@ -67,18 +67,17 @@ class EventUse:
 
 
 def mark_events(
-    episodes: Sequence[EpisodeData], config: SimulatorConfig, settings: EventSettings = DEFAULT.events
+    episodes: Sequence[EpisodeData], config: SimulatorConfig
 ) -> tuple[list[EpisodeData], tuple[Event, ...]]:
     """Find the events of recordings without faults, and mark their rows: no prediction window contains them.
 
     Args:
         episodes: recordings; those without events are returned as they are.
         config: simulator of the car file, for grip and yaw inertia.
-        settings: thresholds.
     """
     marked, events = [], []
     for number, episode in enumerate(episodes, start=1):
-        own = [replace(event, recording=number) for event in find_events(episode, config, settings)]
+        own = [replace(event, recording=number) for event in find_events(episode, config)]
         events += own
         marked.append(_with_column(episode, own) if own else episode)
     return marked, tuple(events)
@@ -90,20 +89,20 @@ def _with_column(episode: EpisodeData, events: Sequence[Event]) -> EpisodeData:
     return replace(episode, extra={**episode.extra, EVENT_COLUMN: inside.astype(np.float64)})
 
 
-def find_events(episode: EpisodeData, config: SimulatorConfig, settings: EventSettings = DEFAULT.events) -> list[Event]:
+def find_events(episode: EpisodeData, config: SimulatorConfig) -> list[Event]:
     """Events of a recording without faults, in the order of time; none if its period is too long to see them."""
-    if episode.ticks < 2 or episode.period_s > settings.max_period_s:
+    if episode.ticks < 2 or episode.period_s > EVENTS.max_period_s:
         return []
     stretches = [_Stretch.of(episode, rows) for rows in unbroken_rows(episode)]
     if not stretches:
         return []
-    impacts = _impact_rows(stretches, config.parameters, settings)
+    impacts = _impact_rows(stretches, config.parameters)
     found = []
     for stretch, impact in zip(stretches, impacts, strict=True):
-        carried = _carried_rows(stretch, config.parameters, settings)
-        for first, last in _merged(stretch.t_s, impact | carried, settings.merge_s):
+        carried = _carried_rows(stretch, config.parameters)
+        for first, last in _merged(stretch.t_s, impact | carried, EVENTS.merge_s):
             kind: Literal["impact", "carried"] = "carried" if carried[first : last + 1].any() else "impact"
-            velocity, yaw_rate = stretch.change_over(first, last, settings)
+            velocity, yaw_rate = stretch.change_over(first, last)
             began_s, ended_s = (float(stretch.t_s[k] - episode.times_s[0]) for k in (first, last))
             x_m, y_m = (float(v) for v in stretch.pose[first, :2])
             found.append(Event(kind, began_s, ended_s, x_m, y_m, velocity, yaw_rate))
@@ -163,9 +162,9 @@ class _Stretch:
         elapsed_s[rows] = 0.5 * (self.t_s[c] + self.t_s[d] - self.t_s[a] - self.t_s[b])
         return _Changes(values, elapsed_s)
 
-    def change_over(self, first: int, last: int, settings: EventSettings) -> tuple[float, float]:
+    def change_over(self, first: int, last: int) -> tuple[float, float]:
         """Size of the change of velocity, and change of yaw rate, from before row ``first`` to after row ``last``."""
-        width, end = self.rows_of(settings.lasting_width_s), len(self.t_s) - 1
+        width, end = self.rows_of(EVENTS.lasting_width_s), len(self.t_s) - 1
         before, after = max(first - 1, 1), min(last + 1, end - 1)
         early = self._velocities(np.array([max(before - width, 0)]), np.array([before]))
         late = self._velocities(np.array([after]), np.array([min(after + width, end)]))
@@ -177,24 +176,24 @@ class _Stretch:
         return np.asarray((self.pose[last] - self.pose[first]) / (self.t_s[last] - self.t_s[first])[:, None])
 
 
-def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters, settings: EventSettings) -> list[BoolArray]:
+def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters) -> list[BoolArray]:
     """Rows (n,) of each stretch around which velocity or yaw rate change too fast: stretches with a lasting change."""
     fast, lasting = ([np.zeros(len(s.t_s), dtype=bool) for s in stretches] for _ in range(2))
-    limits = np.array(settings.grip_factors) * grip_limits(car)
-    for width_s in settings.widths_s:
+    limits = np.array(EVENTS.grip_factors) * grip_limits(car)
+    for width_s in EVENTS.widths_s:
         width = stretches[0].rows_of(width_s)
         changes = [s.changes(width, 0) for s in stretches]
         if not any(np.isfinite(c.elapsed_s).any() for c in changes):
             continue
-        steady = [median_filter(np.nan_to_num(c.values), (settings.steady_widths * width, 1)) for c in changes]
-        usual = _usual_changes(stretches, changes, steady, settings)
+        steady = [median_filter(np.nan_to_num(c.values), (EVENTS.steady_widths * width, 1)) for c in changes]
+        usual = _usual_changes(stretches, changes, steady)
         for k, (stretch, change) in enumerate(zip(stretches, changes, strict=True)):
             is_fast = change.sizes > np.maximum(limits * change.elapsed_s[:, None], usual)
-            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), width)
+            later = stretch.changes(stretch.rows_of(EVENTS.lasting_width_s), width)
             expected = steady[k] * (later.elapsed_s / change.elapsed_s)[:, None]
             lasts = np.minimum(_along(later.values, change), _along(later.values - expected, change))
             fast[k] |= is_fast.any(axis=1)
-            lasting[k] |= (is_fast & (lasts >= settings.lasting_share * change.sizes**2)).any(axis=1)
+            lasting[k] |= (is_fast & (lasts >= EVENTS.lasting_share * change.sizes**2)).any(axis=1)
     for is_fast, is_lasting in zip(fast, lasting, strict=True):
         for first, end in runs(is_fast):
             is_fast[first:end] = is_lasting[first:end].any()
@@ -208,24 +207,24 @@ def _along(later: FloatArray, change: _Changes) -> FloatArray:
 
 
 def _usual_changes(
-    stretches: Sequence[_Stretch], changes: Sequence[_Changes], steady: Sequence[FloatArray], settings: EventSettings
+    stretches: Sequence[_Stretch], changes: Sequence[_Changes], steady: Sequence[FloatArray]
 ) -> FloatArray:
     """Changes (2,) of velocity and yaw rate that usual driving and noise do not exceed."""
     values, sizes = np.concatenate([c.values for c in changes]), np.concatenate([c.sizes for c in changes])
     is_known = np.isfinite(values).all(axis=1)
-    is_moving = is_known & (np.concatenate([s.speed_mps for s in stretches]) > settings.moving_mps)
+    is_moving = is_known & (np.concatenate([s.speed_mps for s in stretches]) > EVENTS.moving_mps)
     usual = np.zeros(2)
-    if is_moving.sum() >= settings.min_moving_rows:
-        usual = np.quantile(sizes[is_moving], settings.usual_quantile, axis=0)
+    if is_moving.sum() >= EVENTS.min_moving_rows:
+        usual = np.quantile(sizes[is_moving], EVENTS.usual_quantile, axis=0)
     rough = (values - np.concatenate(steady))[is_known]
     x, y, yaw = (robust_std(column) for column in rough.T)
-    return np.asarray(np.maximum(settings.usual_factor * usual, settings.noise_z * np.array([max(x, y), yaw])))
+    return np.asarray(np.maximum(EVENTS.usual_factor * usual, EVENTS.noise_z * np.array([max(x, y), yaw])))
 
 
-def _carried_rows(stretch: _Stretch, car: CarParameters, settings: EventSettings) -> BoolArray:
+def _carried_rows(stretch: _Stretch, car: CarParameters) -> BoolArray:
     """Rows (n,) in which the car is carried: it moves sideways, and its tyres do not brake that motion."""
     found = np.zeros(len(stretch.t_s), dtype=bool)
-    width = 2 * max(stretch.rows_of(settings.slide_half_width_s), 2) + 1
+    width = 2 * max(stretch.rows_of(EVENTS.slide_half_width_s), 2) + 1
     if len(stretch.t_s) < width:
         return found
     rate, rate2 = (savgol_filter(stretch.pose, width, 2, deriv=k, delta=stretch.period_s, axis=0) for k in (1, 2))
@@ -233,14 +232,12 @@ def _carried_rows(stretch: _Stretch, car: CarParameters, settings: EventSettings
     side = np.sign(vy)
     braking = -side * body_states(stretch.pose, rate2)[:, 4]
     axles = side * (vy + car.front_axle_m * yaw_rate), side * (vy - car.rear_axle_m * yaw_rate)
-    is_sliding = (np.abs(vy) > np.maximum(np.abs(vx), settings.slide_mps)) & (
-        np.minimum(*axles) > 0.5 * settings.slide_mps
-    )
-    is_free = is_sliding & (braking < settings.slide_friction_share * grip_limits(car)[0])
-    standing = np.flatnonzero(np.hypot(vx, vy) < settings.moving_mps)
-    reach = stretch.rows_of(settings.carry_s)
+    is_sliding = (np.abs(vy) > np.maximum(np.abs(vx), EVENTS.slide_mps)) & (np.minimum(*axles) > 0.5 * EVENTS.slide_mps)
+    is_free = is_sliding & (braking < EVENTS.slide_friction_share * grip_limits(car)[0])
+    standing = np.flatnonzero(np.hypot(vx, vy) < EVENTS.moving_mps)
+    reach = stretch.rows_of(EVENTS.carry_s)
     for first, end in runs(is_free):
-        if stretch.t_s[end - 1] - stretch.t_s[first] < settings.slide_s - 1e-6:
+        if stretch.t_s[end - 1] - stretch.t_s[first] < EVENTS.slide_s - 1e-6:
             continue
         stop, restart = (standing[standing < first], standing[standing >= end])
         begin = max(first - reach, 0, *stop[-1:])

@@ -18,6 +18,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.settings import EVIDENCE
 from carlab.diagnosis.unexplained.description import start_features, worst_regime
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
@@ -132,9 +133,8 @@ def _finding(scored: ScoredSearch, name: str, jacobian: FloatArray) -> EffectFin
 
 def _confidence(scored: ScoredSearch, name: str) -> float:
     """Probability that the name is right, by the logistic regression of the settings on the root of chi2."""
-    settings = scored.problem.settings.evidence
     root = math.sqrt(max(scored.found.chi2[name], 1e-3))
-    return float(1.0 / (1.0 + (settings.confidence_half / root) ** settings.confidence_slope))
+    return float(1.0 / (1.0 + (EVIDENCE.confidence_half / root) ** EVIDENCE.confidence_slope))
 
 
 def _where(
@@ -159,12 +159,12 @@ def _where(
 
 def estimate(scored: ScoredSearch, name: str) -> Estimate:
     """A fitted number with its 90 % interval."""
-    settings, fit = scored.problem.settings.evidence, scored.fit
+    fit = scored.fit
     index = [f.name for f in fit.free].index(name)
     free, z = fit.free[index], float(fit.z[index])
     assert fit.covariance is not None
-    z90 = interval_quantile(len(np.unique(scored.problem.windows.block)), settings.interval_probability)
-    min_relative_std = settings.joint_min_relative_std if scored.is_joint else settings.min_relative_std
+    z90 = interval_quantile(len(np.unique(scored.problem.windows.block)), EVIDENCE.interval_probability)
+    min_relative_std = EVIDENCE.joint_min_relative_std if scored.is_joint else EVIDENCE.min_relative_std
     std_z = standard_error_factor(scored) * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
     low, value, high = (float(free.value(np.array(z + k * std_z))) for k in (-z90, 0.0, z90))
     margin = z90 * math.hypot(min_relative_std * abs(value), _model_error_std(scored, free, value))
@@ -176,10 +176,9 @@ def estimate(scored: ScoredSearch, name: str) -> Estimate:
 
 def standard_error_factor(scored: ScoredSearch) -> float:
     """Factor on the standard errors of the fit; it grows with the error of the model."""
-    settings = scored.problem.settings.evidence
     if scored.is_joint:
-        return settings.joint_interval_factor
-    return settings.interval_factor + scored.excess * (settings.model_interval_factor - settings.interval_factor)
+        return EVIDENCE.joint_interval_factor
+    return EVIDENCE.interval_factor + scored.excess * (EVIDENCE.model_interval_factor - EVIDENCE.interval_factor)
 
 
 def _model_error_std(scored: ScoredSearch, free: FitParameter, value: float) -> float:
@@ -190,7 +189,7 @@ def _model_error_std(scored: ScoredSearch, free: FitParameter, value: float) -> 
     if not free.name.startswith("effects."):
         return 0.0
     reference = 0.0 if free.logarithmic else float(free.value(np.array(0.0)))
-    return scored.problem.settings.evidence.model_error_share * abs(value - reference) * scored.excess
+    return EVIDENCE.model_error_share * abs(value - reference) * scored.excess
 
 
 def base_estimates(scored: ScoredSearch) -> dict[str, Estimate]:
@@ -222,16 +221,16 @@ def verdict_of(scored: ScoredSearch, has_unnamed: bool, data_faults: Sequence[Da
         return "data"
     if scored.found.effects:
         return "mismatch"
-    settings, problem = scored.problem.settings.evidence, scored.problem
-    score = scored.scores()
+    problem, score = scored.problem, scored.scores()
     best = min(score["refit"], score["nominal"])  # with few recordings a refit may be worse than the car file
-    if (has_unnamed and best > settings.unexplained_score_min) or best > settings.unexplained_score_min_without_term:
+    min_score = EVIDENCE.unexplained_score_min if has_unnamed else EVIDENCE.unexplained_score_min_without_term
+    if best > min_score:
         return "unexplained"
     nominal_loss = problem.fitter(scored.found.scale).loss(problem.nominal)
     gain, spread = clustered_gain(nominal_loss, scored.found.base.loss, problem.windows)
-    is_significant = gain / spread > settings.parameter_z_min
-    is_large = gain > settings.parameter_gain_share * float(nominal_loss.sum())
-    lowers_score = score["refit"] < settings.parameter_score_ratio * score["nominal"]
+    is_significant = gain / spread > EVIDENCE.parameter_z_min
+    is_large = gain > EVIDENCE.parameter_gain_share * float(nominal_loss.sum())
+    lowers_score = score["refit"] < EVIDENCE.parameter_score_ratio * score["nominal"]
     return "parameters" if is_significant and is_large and lowers_score else "none"
 
 
@@ -239,7 +238,7 @@ def unexplained_share(scored: ScoredSearch, described: Fit | None = None) -> flo
     """Share of the refit's squared excess that remains with the accepted effects, or with the fit ``described``."""
     score = scored.scores()
     excess = score["refit"] ** 2 - 1.0
-    if excess <= scored.problem.settings.evidence.min_explained_excess:
+    if excess <= EVIDENCE.min_explained_excess:
         return 0.0
     held_out = scored.held_out
     remaining = score["with_effects"] if described is None else held_out.score(held_out.final_error(described.config))

@@ -42,7 +42,7 @@ class Request:
 
 def fitted_score(scored: ScoredSearch, recordings: SplitRecordings, request: Request) -> float:
     """Score [noise floors] of the model with effects at the end of the windows that were fitted."""
-    fitted = HeldOut.of(recordings.fit_windows, scored.held_out.noise, request.nominal, request.settings.identification)
+    fitted = HeldOut.of(recordings.fit_windows, scored.held_out.noise, request.nominal)
     return fitted.score(fitted.final_error(scored.found.best.config))
 
 
@@ -146,7 +146,7 @@ def adapted(
         return None
     control.progress("adapting along the held-out recordings", 0.93)
     segments = recordings.fit_segments, recordings.held_out_segments
-    return adapt_to_held_out(corrected.fit.config, *segments, corrected.held_out, request.settings.drift)
+    return adapt_to_held_out(corrected.fit.config, *segments, corrected.held_out)
 
 
 def ceiling_of(refit_score: float, model_score: float, network_score: float) -> Ceiling | None:

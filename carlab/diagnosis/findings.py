@@ -21,7 +21,7 @@ from carlab.diagnosis.measured import Estimate as Estimate
 from carlab.diagnosis.measured import FormFinding as FormFinding
 from carlab.diagnosis.measured import RejectedCurves as RejectedCurves
 from carlab.diagnosis.measured import curve_table
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE
 
 SCHEMA = "carlab.diagnosis/1"
 Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"]
@@ -299,7 +299,7 @@ class Diagnosis:
                 found["where"]["place"] = dict(zip(("x", "y", "radius"), e.where.place, strict=True))
             effects.append(found)
         unexplained = None
-        if self.unexplained is not None and self.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
+        if self.unexplained is not None and self.unexplained.share >= EVIDENCE.unexplained_share_min:
             unexplained = asdict(self.unexplained)
             unexplained["class"] = unexplained.pop("kind")
         made = {

@@ -18,6 +18,7 @@ from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.block_jackknife import interval_quantile
 from carlab.diagnosis.identification.fit import Fit, Fitter, Linearisation
 from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
+from carlab.diagnosis.settings import EVIDENCE
 from carlab.jobs.function_workers import FunctionWorkers
 from sim_backends.effects import CATALOGUE
 from sim_backends.registry import REGISTRY
@@ -40,7 +41,7 @@ def effect_limits(scored: ScoredSearch, workers: FunctionWorkers) -> dict[str, d
     fitter = problem.fitter(found.scale)
     fit = replace(scored.fit, config=problem.config_with(found.effects))
     linearised = fitter.linearised(scored.fit)
-    z90 = interval_quantile(len(np.unique(problem.windows.block)), problem.settings.evidence.interval_probability)
+    z90 = interval_quantile(len(np.unique(problem.windows.block)), EVIDENCE.interval_probability)
     factor = standard_error_factor(scored)
     joints = {}
     for effect in CATALOGUE:

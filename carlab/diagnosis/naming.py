@@ -15,7 +15,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_rival import curve_in_addition, replacing_curve
-from carlab.diagnosis.decisions import Alternatives, Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
@@ -131,8 +131,7 @@ def _rival_without_names(
 
 def residual_of(problem: SearchProblem, found: SearchResult, term_chi2_min: float | None = None) -> ResidualModel:
     """Unnamed terms in addition to the accepted effects."""
-    settings = problem.settings.unexplained
-    return fit_residual_terms(problem.windows, found.best, found.scale, term_chi2_min, settings)
+    return fit_residual_terms(problem.windows, found.best, found.scale, term_chi2_min)
 
 
 def _are_spurious(
@@ -150,10 +149,11 @@ def _are_spurious(
     """
     is_additional = rival is not None and rival.names == found.effects
     unnamed_gain = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
-    if not _stand(found, _limits_in_addition(problem, found, unnamed_gain, held_out), control):
+    count = len(found.effects)
+    if not control.effects_stand(found.effects, _limits_in_addition(problem, found, unnamed_gain, held_out), count):
         return True
-    is_small_set = len(found.effects) < problem.settings.rivals.many_effects
-    return is_small_set and not _stand(found, _limits_in_place(problem, found), control)
+    is_small_set = count < problem.settings.rivals.many_effects
+    return is_small_set and not control.effects_stand(found.effects, _limits_in_place(problem, found), count)
 
 
 def _limits_in_addition(
@@ -178,7 +178,7 @@ def _limits_in_addition(
 def _limits_in_place(problem: SearchProblem, found: SearchResult) -> Alternatives:
     """Conditions on the gain of unnamed terms in place of the accepted effects."""
     gain = _gain_of_effects(problem, found)
-    terms = fit_residual_terms(problem.windows, found.base, found.scale, None, problem.settings.unexplained)
+    terms = fit_residual_terms(problem.windows, found.base, found.scale)
     ratio = terms.gain / gain if gain > 0.0 else np.inf
     is_similar = Condition("rivals.unnamed_ratio", ratio, problem.settings.rivals.unnamed_ratio, above=False)
     return (is_similar,), (_is_irrelevant(problem, found, terms.gain - gain),)
@@ -193,14 +193,6 @@ def _is_irrelevant(problem: SearchProblem, found: SearchResult, gain: float) -> 
     """That a gain is a small share of the loss of a perfect simulator."""
     share = gain / (0.5 * found.scale.sigma.size * len(problem.windows))
     return Condition("rivals.min_unnamed_share", share, problem.settings.rivals.min_unnamed_share, above=False)
-
-
-def _stand(found: SearchResult, alternatives: Alternatives, control: RunControl) -> bool:
-    """Whether all conditions of one alternative hold, so that the accepted effects stand; records the decision."""
-    passed = any(all(c.holds for c in conditions) for conditions in alternatives)
-    for name in found.effects:
-        control.record(Decision("stand", name, alternatives, passed, len(found.effects)))
-    return passed
 
 
 def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
@@ -223,7 +215,7 @@ def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldO
     alternatives = tuple(
         (Condition("rivals.min_explained_share", share, settings.min_explained_share),) for share in shares
     )
-    little = not _stand(found, alternatives, control)
+    little = not control.effects_stand(found.effects, alternatives, len(found.effects))
     if little:
         log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), max(shares))
     return little
@@ -246,7 +238,6 @@ def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldO
                 np.zeros((len(windows), 0)),
                 held_out.noise.measured,
                 max_error=problem.settings.selection.max_left_out_error,
-                settings=problem.settings.identification,
             )
             total += float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)
         excess.append(max(total, 0.0))

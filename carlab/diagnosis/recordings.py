@@ -75,7 +75,7 @@ def split_recordings(
         held_out: held-out recordings; if empty, the last part of each recording to fit is held out.
         held_out_share: share of that part.
         nominal: simulator of the car file, for the grip.
-        settings: settings of windows and events.
+        settings: settings of the windows.
         keep_events: whether windows may contain events.
 
     Raises:
@@ -83,8 +83,8 @@ def split_recordings(
         DataError: a recording has fewer than two commands.
     """
     has_own = bool(held_out)
-    marked_fit, fit_events = mark_events(fit, nominal, settings.events)
-    marked_held_out, held_out_events = mark_events(held_out, nominal, settings.events)
+    marked_fit, fit_events = mark_events(fit, nominal)
+    marked_held_out, held_out_events = mark_events(held_out, nominal)
     if not keep_events:
         fit, held_out = marked_fit, marked_held_out
     cut = settings.windows

@@ -10,27 +10,24 @@ from numpy.typing import NDArray
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Skill
 from carlab.diagnosis.identification.gains import clustered_gain
-from carlab.diagnosis.settings import EvidenceSettings
+from carlab.diagnosis.settings import EVIDENCE
 from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, history_rows
 
 
-def skill_of(
-    windows: PredictionWindows, model: FloatArray, constant_velocity: FloatArray, settings: EvidenceSettings
-) -> tuple[Skill, ...]:
+def skill_of(windows: PredictionWindows, model: FloatArray, constant_velocity: FloatArray) -> tuple[Skill, ...]:
     """Compare two predictions of S held-out windows, by recording and regime.
 
     Args:
         windows: the held-out windows.
         model: errors (S, 6) of the diagnosed model after the horizon.
         constant_velocity: errors (S, 6) of constant body velocities and yaw rate.
-        settings: minimum number of windows of a regime.
     """
     distances = [np.hypot(e[:, 0], e[:, 1]) for e in (model, constant_velocity)]
     return tuple(
         _skill(windows, rows, recording, regime, distances)
         for recording in np.unique(windows.recording)
         for regime, rows in _regimes(windows, windows.recording == recording)
-        if rows.sum() >= settings.skill_windows_min
+        if rows.sum() >= EVIDENCE.skill_windows_min
     )
 
 

@@ -15,6 +15,7 @@ from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.evidence import ScoredSearch, estimate
 from carlab.diagnosis.selection.problem import RunControl, has_infinite_identity, numbers_of
 from carlab.diagnosis.selection.search import restrict
+from carlab.diagnosis.settings import EVIDENCE
 from sim_backends.effects import EFFECTS
 
 log = logging.getLogger(__name__)
@@ -52,13 +53,12 @@ def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> Scor
 
 def _conditions(scored: ScoredSearch, effect: str) -> tuple[Condition, ...]:
     """Conditions under which an effect stands: one after a joint fit, one for an effect with an infinite identity."""
-    settings = scored.problem.settings.evidence
     found = []
     if scored.is_joint:
         distance = identity_distance(scored, effect)
-        found.append(Condition("evidence.identity_distance_min", distance, settings.identity_distance_min))
+        found.append(Condition("evidence.identity_distance_min", distance, EVIDENCE.identity_distance_min))
     if effect not in scored.problem.nominal.effects and any(map(has_infinite_identity, numbers_of(effect))):
-        found.append(Condition("evidence.range_ratio_min", range_ratio(scored, effect), settings.range_ratio_min))
+        found.append(Condition("evidence.range_ratio_min", range_ratio(scored, effect), EVIDENCE.range_ratio_min))
     return tuple(found)
 
 

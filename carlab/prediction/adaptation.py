@@ -23,7 +23,7 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import AdaptationNoise, FeatureStd, StateStd
 from carlab.prediction.adaptation_filter import Filtered, Processes, run_filter
-from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.adaptation_settings import ADAPTATION
 from carlab.prediction.disturbances import bounded_final_errors, linearised, simulate_disturbed
 from carlab.prediction.local_error_model import LocalErrorModel, state_features
 from carlab.prediction.predict import simulate_windows
@@ -94,7 +94,6 @@ class AdaptiveModel:
         weight_ends: L ends of the windows that weigh the candidates.
         losses: (1 + C + M, L) of the predictions of ``candidates``, summed with forgetting.
         guard_s: minimum time [s] between the end of a used window and the start of a prediction.
-        settings: settings of the adaptation.
     """
 
     config: SimulatorConfig
@@ -105,7 +104,6 @@ class AdaptiveModel:
     weight_ends: WindowEnds
     losses: FloatArray
     guard_s: float
-    settings: AdaptationSettings
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """As ``PredictiveModel``: weighted mean (S, K + 1, 6) of the predictions of all candidates."""
@@ -116,7 +114,7 @@ class AdaptiveModel:
         """Predictions (1 + C + M, S, K + 1, 6) without a change, by each candidate and by each error model."""
         drifting = self.disturbances(windows.recording, windows.t0_s)
         unchanged = np.zeros((1, *drifting.shape[1:]))
-        predicted = simulate_disturbed(windows, self.config, np.concatenate([unchanged, drifting]), self.settings)
+        predicted = simulate_disturbed(windows, self.config, np.concatenate([unchanged, drifting]))
         corrected = [error_model.corrected(windows, predicted[0]) for error_model in self.error_models]
         return np.concatenate([predicted, np.stack(corrected)]) if corrected else predicted
 
@@ -169,8 +167,8 @@ def adapt(
     config: SimulatorConfig,
     segments: Sequence[RecordingSegment],
     noise: AdaptationNoise,
-    settings: AdaptationSettings | None = None,
     *,
+    time_constants_s: Sequence[float] = ADAPTATION.time_constants_s,
     drifts: Sequence[Sequence[bool]] = SINGLE_AND_ALL,
     fitted: Sequence[RecordingSegment] = (),
     with_error_models: bool = True,
@@ -182,7 +180,7 @@ def adapt(
         config: the fitted simulator.
         segments: all segments of the recordings; an estimate at t uses only their rows before t.
         noise: noise of the filter.
-        settings: settings of the adaptation.
+        time_constants_s: of the drifting disturbances.
         drifts: which of the n drifting disturbances may differ from 0, for each group of candidates; a group has one
             candidate for each time constant.
         fitted: segments of earlier recordings, whose errors also correct the simulator.
@@ -192,18 +190,15 @@ def adapt(
     Raises:
         DataError: the car moves in no window.
     """
-    settings = settings or AdaptationSettings()
-    windows = _windows(segments, settings.window_s, settings.window_s, velocity_window_s2)
-    processes = _processes(noise, settings, np.array(drifts, dtype=np.float64))
+    windows = _measuring_windows(segments, velocity_window_s2)
+    processes = _processes(noise, time_constants_s, np.array(drifts, dtype=np.float64))
     at = np.zeros((*processes.std.shape[:1], len(windows), processes.std.shape[1]))
-    for _ in range(settings.linearisations):
-        measured = linearised(windows, config, at, settings)
+    for _ in range(ADAPTATION.linearisations):
+        measured = linearised(windows, config, at)
         filtered = run_filter(measured, processes)
         at = filtered.predicted
     error_models = tuple(
-        LocalErrorModel(
-            config, segments, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2, settings
-        )
+        LocalErrorModel(config, segments, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2)
         for earlier in ([(), fitted] if fitted else [()])
         if with_error_models
     )
@@ -217,7 +212,6 @@ def adapt(
         none,
         np.zeros((1 + len(at) + len(error_models), 0)),
         guard_s(windows),
-        settings,
     )
     return _with_losses(model, segments, noise, velocity_window_s2)
 
@@ -230,7 +224,6 @@ def guard_s(windows: PredictionWindows) -> float:
 def choose_noise(
     config: SimulatorConfig,
     segments: Sequence[RecordingSegment],
-    settings: AdaptationSettings | None = None,
     *,
     velocity_window_s2: float = 0.0,
 ) -> AdaptationNoise:
@@ -241,9 +234,9 @@ def choose_noise(
     Raises:
         DataError: the car moves in no window.
     """
-    settings = settings or AdaptationSettings()
-    windows = _windows(segments, settings.window_s, settings.window_s, velocity_window_s2)
-    measured = linearised(windows, config, np.zeros((1, len(windows), len(settings.drift_std))), settings)
+    settings = ADAPTATION
+    windows = _measuring_windows(segments, velocity_window_s2)
+    measured = linearised(windows, config, np.zeros((1, len(windows), len(settings.drift_std))))
     calm = np.quantile(np.abs(measured.error[0]), settings.calm_quantile, axis=0)
     calm = np.maximum(calm / ndtri(0.5 + 0.5 * settings.calm_quantile), MIN_STD)
     grid = list(itertools.product(settings.error_shares, settings.white_shares, settings.time_constants_s))
@@ -256,18 +249,18 @@ def choose_noise(
         settings.dof,
     )
     best = int(np.argmin(run_filter(measured, processes).nll.sum(axis=1)))
-    windows = _windows(segments, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
+    windows = _weighing_windows(segments, velocity_window_s2)
     error_std, white_share = _as_std(errors[best] * calm), float(whites[best])
-    plain = _spread(simulate_windows(windows, config)[0], windows, settings)
+    plain = _spread(simulate_windows(windows, config)[0], windows)
     feature_std = cast(FeatureStd, tuple(np.maximum(state_features(windows).std(axis=0), MIN_FEATURE_STD).tolist()))
     noise = AdaptationNoise(error_std, white_share, _as_std(plain), feature_std)
-    adapted = adapt(config, segments, noise, settings, velocity_window_s2=velocity_window_s2).predict(windows)
-    return replace(noise, loss_std=_as_std(np.minimum(plain, _spread(adapted, windows, settings))))
+    adapted = adapt(config, segments, noise, velocity_window_s2=velocity_window_s2).predict(windows)
+    return replace(noise, loss_std=_as_std(np.minimum(plain, _spread(adapted, windows))))
 
 
-def _spread(predicted: FloatArray, windows: PredictionWindows, settings: AdaptationSettings) -> FloatArray:
+def _spread(predicted: FloatArray, windows: PredictionWindows) -> FloatArray:
     """Robust standard deviations (6,) of the errors of predictions (S, K + 1, 6) after the windows."""
-    errors = bounded_final_errors(windows, predicted, settings)
+    errors = bounded_final_errors(windows, predicted)
     return np.asarray(np.maximum(np.median(np.abs(errors), axis=0) / ndtri(0.75), MIN_STD))
 
 
@@ -279,39 +272,48 @@ def _with_losses(
     model: AdaptiveModel, segments: Sequence[RecordingSegment], noise: AdaptationNoise, velocity_window_s2: float
 ) -> AdaptiveModel:
     """The model with the losses of all candidates along the segments; without a long enough window the same model."""
-    settings = model.settings
     try:
-        windows = _windows(segments, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
+        windows = _weighing_windows(segments, velocity_window_s2)
     except DataError:
         return model
-    errors = bounded_final_errors(windows, model.candidates(windows), settings)
+    errors = bounded_final_errors(windows, model.candidates(windows))
     distance_sq = np.sum((errors / noise.loss_std) ** 2, axis=-1)
-    losses = 0.5 * (settings.dof + errors.shape[-1]) * np.log1p(distance_sq / settings.dof)
+    losses = 0.5 * (ADAPTATION.dof + errors.shape[-1]) * np.log1p(distance_sq / ADAPTATION.dof)
     weight_ends = WindowEnds(windows.recording, windows.t0_s + windows.horizon_s)
-    return replace(model, weight_ends=weight_ends, losses=_forgetting_sums(losses, weight_ends, settings))
+    return replace(model, weight_ends=weight_ends, losses=_forgetting_sums(losses, weight_ends))
 
 
-def _forgetting_sums(losses: FloatArray, ends: WindowEnds, settings: AdaptationSettings) -> FloatArray:
+def _forgetting_sums(losses: FloatArray, ends: WindowEnds) -> FloatArray:
     """Sums of losses (C, L) of each recording up to each window, with exponential forgetting."""
-    total = losses * min(settings.weight_stride_s / settings.weight_dependence_s, 1.0)
+    total = losses * min(ADAPTATION.weight_stride_s / ADAPTATION.weight_dependence_s, 1.0)
     for k in range(1, len(ends.end_s)):
         if ends.recording[k] == ends.recording[k - 1]:
             elapsed_s = ends.end_s[k] - ends.end_s[k - 1]
-            total[:, k] += np.exp(-elapsed_s / settings.weight_memory_s) * total[:, k - 1]
+            total[:, k] += np.exp(-elapsed_s / ADAPTATION.weight_memory_s) * total[:, k - 1]
     return total
 
 
-def _processes(noise: AdaptationNoise, settings: AdaptationSettings, drifts: FloatArray) -> Processes:
+def _processes(noise: AdaptationNoise, time_constants_s: Sequence[float], drifts: FloatArray) -> Processes:
     """One candidate for each time constant and each row of ``drifts`` (G, n)."""
-    times_s = np.tile(settings.time_constants_s, len(drifts))
+    times_s = np.tile(time_constants_s, len(drifts))
     count = len(times_s)
     return Processes(
-        np.repeat(drifts * settings.drift_std, len(settings.time_constants_s), axis=0),
+        np.repeat(drifts * ADAPTATION.drift_std, len(time_constants_s), axis=0),
         times_s,
         np.tile(noise.error_std, (count, 1)),
-        np.tile(noise.white_share * np.array(settings.white_std), (count, 1)),
-        settings.dof,
+        np.tile(noise.white_share * np.array(ADAPTATION.white_std), (count, 1)),
+        ADAPTATION.dof,
     )
+
+
+def _measuring_windows(segments: Sequence[RecordingSegment], velocity_window_s2: float) -> PredictionWindows:
+    """Windows that measure the disturbances, one after the other."""
+    return _windows(segments, ADAPTATION.window_s, ADAPTATION.window_s, velocity_window_s2)
+
+
+def _weighing_windows(segments: Sequence[RecordingSegment], velocity_window_s2: float) -> PredictionWindows:
+    """Windows that weigh the candidates."""
+    return _windows(segments, ADAPTATION.weight_horizon_s, ADAPTATION.weight_stride_s, velocity_window_s2)
 
 
 def _windows(

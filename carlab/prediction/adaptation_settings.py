@@ -55,3 +55,6 @@ class AdaptationSettings:
     """Finite differences of the Jacobian [same units]."""
     max_error: float = 100.0
     """Bound of an error [m, rad, m/s, rad/s]; it also replaces errors of a diverged simulator."""
+
+
+ADAPTATION = AdaptationSettings()

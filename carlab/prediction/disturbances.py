@@ -8,8 +8,8 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.prediction.adaptation_filter import MeasuredWindows
-from carlab.prediction.adaptation_settings import AdaptationSettings
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.adaptation_settings import ADAPTATION
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
@@ -25,17 +25,14 @@ class DisturbedModel:
 
     config: SimulatorConfig
     disturbances: FloatArray
-    settings: AdaptationSettings
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """As ``PredictiveModel``: (S, K + 1, 6)."""
         constant = np.broadcast_to(self.disturbances, (1, len(windows), len(self.disturbances)))
-        return np.asarray(simulate_disturbed(windows, self.config, constant, self.settings)[0])
+        return np.asarray(simulate_disturbed(windows, self.config, constant)[0])
 
 
-def linearised(
-    windows: PredictionWindows, config: SimulatorConfig, at: FloatArray, settings: AdaptationSettings
-) -> MeasuredWindows:
+def linearised(windows: PredictionWindows, config: SimulatorConfig, at: FloatArray) -> MeasuredWindows:
     """Errors after S windows with disturbances ``at`` (C, S, n), and their Jacobian by all m disturbances.
 
     The disturbances have the units of ``simulate_disturbed``.
@@ -43,19 +40,17 @@ def linearised(
     candidates, count, size = at.shape
     total = len(DISTURBANCE_NAMES)
     full = np.zeros((candidates, count, total))
-    full[..., :size] = np.clip(at, -np.array(settings.limits[:size]), settings.limits[:size])
-    steps = np.array(settings.steps)
+    full[..., :size] = np.clip(at, -np.array(ADAPTATION.limits[:size]), ADAPTATION.limits[:size])
+    steps = np.array(ADAPTATION.steps)
     moved = full[:, None] + np.concatenate([np.zeros((1, total)), np.diag(steps)])[None, :, None, :]
-    predicted = simulate_disturbed(windows, config, moved.reshape(-1, count, total), settings)
-    error = bounded_final_errors(windows, predicted, settings).reshape(candidates, total + 1, count, 6)
+    predicted = simulate_disturbed(windows, config, moved.reshape(-1, count, total))
+    error = bounded_final_errors(windows, predicted).reshape(candidates, total + 1, count, 6)
     jacobian = (error[:, 1:] - error[:, :1]) / steps[None, :, None, None]
     end_s = windows.t0_s + windows.horizon_s
     return MeasuredWindows(windows.recording, end_s, error[:, 0], np.moveaxis(jacobian, 1, -1), full)
 
 
-def simulate_disturbed(
-    windows: PredictionWindows, config: SimulatorConfig, disturbances: FloatArray, settings: AdaptationSettings
-) -> FloatArray:
+def simulate_disturbed(windows: PredictionWindows, config: SimulatorConfig, disturbances: FloatArray) -> FloatArray:
     """Predict S windows with C sets of disturbances (C, S, n or m) [1, rad, 1, m/s2, m/s2, rad/s2].
 
     Returns:
@@ -64,7 +59,7 @@ def simulate_disturbed(
     parameters, size = config.parameters, disturbances.shape[-1]
     mass_kg, inertia_kgm2 = parameters.mass_kg, parameters.yaw_inertia_kgm2
     unit = np.array([1.0, 1.0, 1.0, mass_kg, mass_kg, inertia_kgm2])[:size]
-    limits = np.array(settings.limits[:size])
+    limits = np.array(ADAPTATION.limits[:size])
     given = np.clip(disturbances, -limits, limits) * unit
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation has bounded errors
         return simulate_windows(
@@ -72,11 +67,10 @@ def simulate_disturbed(
         )
 
 
-def bounded_final_errors(windows: PredictionWindows, predicted: FloatArray, settings: AdaptationSettings) -> FloatArray:
+def bounded_final_errors(windows: PredictionWindows, predicted: FloatArray) -> FloatArray:
     """Errors (..., S, 6) of predictions (..., S, K + 1, 6) after the windows, finite and bounded.
 
     Errors are x, y in the body frame [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
     """
-    bound = settings.max_error
-    error = prediction_errors(predicted[..., -1:, :], replace(windows, measured=windows.measured[:, -1:]))[..., 0, :]
-    return np.nan_to_num(error, nan=bound, posinf=bound, neginf=-bound).clip(-bound, bound)
+    last = replace(windows, measured=windows.measured[:, -1:])
+    return bounded(prediction_errors(predicted[..., -1:, :], last)[..., 0, :], ADAPTATION.max_error)

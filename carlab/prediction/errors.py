@@ -49,8 +49,12 @@ def prediction_errors(predicted: FloatArray, windows: PredictionWindows, ticks: 
 
 def final_errors(model: PredictiveModel, windows: PredictionWindows) -> FloatArray:
     """Errors (S, 6) of a model after the horizon, as ``prediction_errors``, finite and within ``MAX_ERROR``."""
-    error = prediction_errors(model.predict(windows), windows)[:, -1]
-    return np.nan_to_num(error, nan=MAX_ERROR, posinf=MAX_ERROR, neginf=-MAX_ERROR).clip(-MAX_ERROR, MAX_ERROR)
+    return bounded(prediction_errors(model.predict(windows), windows)[:, -1], MAX_ERROR)
+
+
+def bounded(errors: FloatArray, limit: float) -> FloatArray:
+    """Errors (...) within ``limit``; NaN, as a diverged simulation gives it, becomes ``limit``."""
+    return np.fmax(np.fmin(errors, limit), -limit)  # of NaN and a number, these return the number
 
 
 def channel_errors(errors: FloatArray) -> tuple[ChannelError, ...]:

@@ -18,8 +18,8 @@ from scipy.spatial.distance import cdist
 from carlab.core.errors import DataError
 from carlab.core.planar import to_world
 from carlab.core.quantities import FloatArray
-from carlab.prediction.adaptation_settings import AdaptationSettings
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.adaptation_settings import ADAPTATION
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
@@ -39,7 +39,6 @@ class LocalErrorModel:
         state_std: (7,) standard deviations of ``state_features``, by which these are divided.
         guard_s: minimum time [s] between the end of a used window and the start of a prediction.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
-        settings: settings of the adaptation.
     """
 
     config: SimulatorConfig
@@ -48,7 +47,6 @@ class LocalErrorModel:
     state_std: FloatArray
     guard_s: float
     velocity_window_s2: float
-    settings: AdaptationSettings
 
     def corrected(self, windows: PredictionWindows, predicted: FloatArray) -> FloatArray:
         """Predictions (S, K + 1, 6) of the simulator less their expected errors.
@@ -70,23 +68,21 @@ class LocalErrorModel:
             known = np.ones((len(states[rows]), len(past_states)), dtype=bool)
             if past is not None:
                 known[:, : len(past)] = self._is_known(windows, past, rows)
-            weights = _weights(states[rows], past_states, known, self.settings)
+            weights = _weights(states[rows], past_states, known)
             expected[rows] = np.tensordot(weights, errors, axes=1)
         return predicted - _in_world(expected, windows)
 
     def _windows(self, segments: Sequence[RecordingSegment], horizon_s: float) -> PredictionWindows | None:
         """Windows of the segments; None if the car moves in none."""
         try:
-            windows = cut_windows(segments, horizon_s, self.settings.weight_stride_s) if segments else None
+            windows = cut_windows(segments, horizon_s, ADAPTATION.weight_stride_s) if segments else None
         except DataError:
             return None
         return None if windows is None else replace(windows, velocity_window_s2=self.velocity_window_s2)
 
     def _errors(self, windows: PredictionWindows) -> FloatArray:
         """Errors (S, K + 1, 6) of the simulator, finite and bounded."""
-        bound = self.settings.max_error
-        errors = prediction_errors(simulate_windows(windows, self.config)[0], windows)
-        return np.nan_to_num(errors, nan=bound, posinf=bound, neginf=-bound).clip(-bound, bound)
+        return bounded(prediction_errors(simulate_windows(windows, self.config)[0], windows), ADAPTATION.max_error)
 
     def _is_known(self, windows: PredictionWindows, past: PredictionWindows, rows: slice) -> NDArray[np.bool_]:
         """Which windows of the past (s, N) end before windows of a batch start."""
@@ -105,20 +101,18 @@ def state_features(windows: PredictionWindows) -> FloatArray:
     )
 
 
-def _weights(
-    states: FloatArray, past_states: FloatArray, known: NDArray[np.bool_], settings: AdaptationSettings
-) -> FloatArray:
+def _weights(states: FloatArray, past_states: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     """Weights (s, N) of past errors in the posterior mean at ``states`` (s, 7); 0 where they are not ``known``."""
     distance_sq = np.where(known, cdist(states, past_states, "sqeuclidean"), np.inf)
-    count = min(settings.local_neighbours, len(past_states))
+    count = min(ADAPTATION.local_neighbours, len(past_states))
     nearest = np.argpartition(distance_sq, count - 1, axis=1)[:, :count]
-    kernel = np.exp(-0.5 * np.take_along_axis(distance_sq, nearest, axis=1) / settings.local_length**2)
+    kernel = np.exp(-0.5 * np.take_along_axis(distance_sq, nearest, axis=1) / ADAPTATION.local_length**2)
     chosen = past_states[nearest]
     between = np.sum((chosen[:, :, None] - chosen[:, None]) ** 2, axis=-1)
-    covariance = np.exp(-0.5 * between / settings.local_length**2) + settings.local_noise * np.eye(count)
+    covariance = np.exp(-0.5 * between / ADAPTATION.local_length**2) + ADAPTATION.local_noise * np.eye(count)
     weights = np.zeros(distance_sq.shape)
     used = np.isfinite(np.take_along_axis(distance_sq, nearest, axis=1))
-    covariance = np.where(used[:, :, None] & used[:, None], covariance, (1.0 + settings.local_noise) * np.eye(count))
+    covariance = np.where(used[:, :, None] & used[:, None], covariance, (1.0 + ADAPTATION.local_noise) * np.eye(count))
     np.put_along_axis(weights, nearest, np.linalg.solve(covariance, kernel[..., None])[..., 0], axis=1)
     return weights
 

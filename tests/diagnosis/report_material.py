@@ -3,6 +3,7 @@
 import functools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from carlab.diagnosis.findings import (
     Trace,
     Unexplained,
 )
+from carlab.diagnosis.report.next_drive import with_texts
 from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -112,7 +114,12 @@ def mismatch() -> Diagnosis:
     held = {"nominal": NOMINAL, "refit": REFIT, "with_effects": WITH, "noise_floor": FLOOR}
     faults = (DataFault("yaw_wrap_spikes", "yaw_rate", 21, "repaired from the pose"),)
     effects = (lag_finding(), patch_finding())
-    return Diagnosis("mismatch", "", effects, PARAMETERS, 1.0, held, None, faults, USES, 7, 41.3)
+    return with_texts(Diagnosis("mismatch", "", effects, PARAMETERS, 1.0, held, None, faults, USES, 7, 41.3))
+
+
+def changed(diagnosis: Diagnosis, **changes: Any) -> Diagnosis:
+    """The diagnosis with other results, and with the sentences for these."""
+    return with_texts(replace(diagnosis, advice="", **changes))
 
 
 def figure_data() -> FigureData:
@@ -140,24 +147,24 @@ def figure_data() -> FigureData:
 
 def parameters_only() -> Diagnosis:
     held = {"nominal": NOMINAL, "refit": replace(WITH, score=1.08), "noise_floor": FLOOR}
-    return replace(mismatch(), verdict="parameters", effects=(), held_out=held, data_faults=())
+    return changed(mismatch(), verdict="parameters", effects=(), held_out=held, data_faults=())
 
 
 def no_mismatch() -> Diagnosis:
     held = {"nominal": replace(WITH, score=1.03), "refit": replace(WITH, score=1.02), "noise_floor": FLOOR}
-    return replace(parameters_only(), verdict="none", held_out=held)
+    return changed(parameters_only(), verdict="none", held_out=held)
 
 
 def faulty_data() -> Diagnosis:
     fault = DataFault("stale_samples", "yaw_rate", 1834, "unusable: the column repeats itself for 61 s")
-    return replace(no_mismatch(), verdict="data", held_out={}, parameters={}, data_faults=(fault,))
+    return changed(no_mismatch(), verdict="data", held_out={}, parameters={}, data_faults=(fault,))
 
 
 def unexplained_physics() -> Diagnosis:
     unexplained = Unexplained(
         0.83, ("vx", "x"), "speed > 1.8 m/s", "even in steering, grows with speed; acts on vx", "a_x = -0.31 |d| v"
     )
-    return replace(no_mismatch(), verdict="unexplained", held_out=mismatch().held_out, unexplained=unexplained)
+    return changed(no_mismatch(), verdict="unexplained", held_out=mismatch().held_out, unexplained=unexplained)
 
 
 def inconclusive() -> Diagnosis:

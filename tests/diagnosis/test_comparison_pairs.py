@@ -12,12 +12,11 @@ import pytest
 from carlab.benchmark.cases.scene import Concealed, Scene
 from carlab.benchmark.effects.catalogue import EFFECT_IDS, are_confusable
 from carlab.benchmark.effects.forms import all_forms
-from carlab.benchmark.world.measurement import as_table, write_csv
-from carlab.cars import load_car_file
+from carlab.benchmark.world.measurement import as_table
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.comparison.compare import compare
 from carlab.diagnosis.comparison.result import Comparison
-from carlab.recording.csv.foreign import import_csv
+from tests.helpers.case_files import car_in, imported
 
 LENGTHS_S = (60.0, 60.0, 60.0, 60.0)
 """Two drives of each group."""
@@ -30,8 +29,7 @@ def drives(scene: Scene, concealed: Sequence[Concealed], parts: slice, folder: P
     """Recordings of these parts of the scene, driven with the concealed effects, as a user would import them."""
     found = []
     for k, recording in enumerate(scene.drive(concealed)[1][parts]):
-        write_csv(folder / f"{k}.csv", as_table(recording))
-        found += import_csv(folder / f"{k}.csv").episodes
+        found += imported(as_table(recording), folder / f"{k}.csv")
     return found
 
 
@@ -47,7 +45,7 @@ def compared(seed: int, change: str | None, excess: float, folder: Path) -> Comp
     first = drives(scene, (), slice(0, 2), folder)
     second = drives(scene, concealed, slice(2, 4), folder)
     scene.nominal.write(folder / "car.toml")
-    return compare(first, second, load_car_file(folder / "car.toml").simulator)
+    return compare(first, second, car_in(folder))
 
 
 @pytest.mark.slow

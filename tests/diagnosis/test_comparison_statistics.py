@@ -12,10 +12,8 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
 from carlab.diagnosis.comparison.drive_spread import DriveSpread, parts_of, spread_prior
 from carlab.diagnosis.identification.error_model import CrossFittedErrors, ErrorModel
-from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import PredictionWindows
 
-SETTINGS = DEFAULT.comparison
 SIZE = 12
 PARTS, BLOCKS, WINDOWS = 8, 4, 6
 """Parts of a group, blocks of a part, and windows of a block."""
@@ -47,7 +45,7 @@ def p_values(deviation: float, *, with_spread: bool, count: int = 300) -> FloatA
     for _ in range(count):
         secant = rng.standard_normal((PARTS * BLOCKS * WINDOWS, SIZE))
         both = [group(rng, deviation, secant, WINDOWS) for _ in range(2)]
-        one = difference([secant, secant], both, UNIT, SETTINGS)
+        one = difference([secant, secant], both, UNIT)
         assert isinstance(one, Difference)
         used = one if with_spread else replace(one, spread=DriveSpread(1.0, 1e6))
         found.append(p_value(used, one.likelihood_ratio, 1))
@@ -76,7 +74,7 @@ def test_shorter_group_with_more_windows_per_block_keeps_the_rate_of_false_chang
             one = group(rng, 0.0, secant, windows)
             of_block = 0.3 * rng.standard_normal(int(one.block.max()) + 1)
             both.append(replace(one, errors=one.errors - of_block[one.block, None] * secant))
-        change = difference(secants, both, UNIT, SETTINGS)
+        change = difference(secants, both, UNIT)
         assert change is not None
         found.append(p_value(replace(change, spread=DriveSpread(1.0, 1e6)), change.likelihood_ratio, 1))
     assert np.mean(np.array(found) < 0.05) == pytest.approx(0.05, abs=0.025)
@@ -87,7 +85,7 @@ def test_candidate_that_acts_in_few_blocks_is_left_out() -> None:
     secant = rng.standard_normal((PARTS * BLOCKS * WINDOWS, SIZE))
     both = [group(rng, 0.0, secant, WINDOWS) for _ in range(2)]
     few = np.where(both[0].block[:, None] < 3, secant, 0.0)
-    assert difference([few, secant], both, UNIT, SETTINGS) is None
+    assert difference([few, secant], both, UNIT) is None
 
 
 @pytest.mark.parametrize(("ratio", "dof"), [(1.0, 4.0), (2.5, 10.0)])
@@ -101,10 +99,10 @@ def test_prior_of_the_spread_is_that_of_its_sample(ratio: float, dof: float) -> 
 
 def test_moderated_spread_lies_between_prior_and_estimate() -> None:
     prior = spread_prior([DriveSpread(float(s), 3.0) for s in stats.f.rvs(3, 5, size=2000, random_state=4)])
-    assert prior.ratio < prior.moderated(DriveSpread(9.0, 3.0), 1.0, SETTINGS).ratio < 9.0
-    assert prior.moderated(DriveSpread(0.1, 3.0), 1.0, SETTINGS).ratio == 1.0
-    long_drive = prior.moderated(DriveSpread(9.0, 3.0), 2.0, SETTINGS).ratio
-    assert long_drive - 1.0 == pytest.approx(2.0 * (prior.moderated(DriveSpread(9.0, 3.0), 1.0, SETTINGS).ratio - 1.0))
+    assert prior.ratio < prior.moderated(DriveSpread(9.0, 3.0), 1.0).ratio < 9.0
+    assert prior.moderated(DriveSpread(0.1, 3.0), 1.0).ratio == 1.0
+    long_drive = prior.moderated(DriveSpread(9.0, 3.0), 2.0).ratio
+    assert long_drive - 1.0 == pytest.approx(2.0 * (prior.moderated(DriveSpread(9.0, 3.0), 1.0).ratio - 1.0))
 
 
 def test_part_lies_in_one_drive() -> None:
@@ -124,7 +122,7 @@ def test_errors_of_the_first_group_are_as_large_as_those_of_new_windows() -> Non
 
     ratios = []
     for errors in draws:
-        models = CrossFittedErrors.of(errors, np.arange(60) // 12, SETTINGS)
+        models = CrossFittedErrors.of(errors, np.arange(60) // 12)
         of_new = median_distance(models.whole.decorrelated(new))
         ratios.append(
             [

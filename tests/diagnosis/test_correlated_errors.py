@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from carlab.benchmark.cases.case import make_case
-from carlab.benchmark.world.measurement import write_csv
-from carlab.cars import load_car_file
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.selection.correlated_errors import decorrelating, without_unsupported_effects
@@ -16,8 +14,8 @@ from carlab.diagnosis.selection.refit import fit_base, fit_with_scale
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
-from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.case_files import car_in, episodes_in, write_case
 
 EFFECT = "mocap_yaw_misalignment"
 ANGLE, GAIN = f"effects.{EFFECT}.angle", "motor.drive_gain"
@@ -28,14 +26,9 @@ NOISE = np.array([0.001, 0.001, 0.002, 0.01, 0.01, 0.03])
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[PredictionWindows, SimulatorConfig]:
     """Windows of a simulated drive, and its true car with the effect at its identity value."""
-    folder = tmp_path_factory.mktemp("drive")
-    case = make_case("null", 31, fit_s=60, hold_s=20)
-    case.nominal.write(folder / "car.toml")
-    write_csv(folder / "drive.csv", case.fit)
-    segments = segments_of(import_csv(folder / "drive.csv").episodes)
-    windows = cut_windows(segments, DEFAULT.windows.fit_window_s, 0.5, 2.0)
-    car = load_car_file(folder / "car.toml").simulator
-    return windows, replace(car, effects={EFFECT: {"angle": 0.0}})
+    folder = write_case(make_case("null", 31, fit_s=60, hold_s=20), tmp_path_factory.mktemp("drive"))
+    windows = cut_windows(segments_of(episodes_in(folder / "fit.csv")), DEFAULT.windows.fit_window_s, 0.5, 2.0)
+    return windows, replace(car_in(folder), effects={EFFECT: {"angle": 0.0}})
 
 
 def measured_by(

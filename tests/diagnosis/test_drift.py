@@ -11,8 +11,6 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.drift import drift_sentence
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.write import completed
-from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.changing_drives import changing_drive
@@ -27,7 +25,7 @@ def drift_of(fit, held_out, config=CONFIG):
     fit_segments, segments = segments_of(fit), segments_of(held_out)
     windows = cut_windows(segments, 1.0, 0.25)
     noise = estimate_noise(fit_segments, windows.curvature_bias)
-    return adapt_to_held_out(config, fit_segments, segments, HeldOut.of(windows, noise, config), DEFAULT.drift).drift
+    return adapt_to_held_out(config, fit_segments, segments, HeldOut.of(windows, noise, config)).drift
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +84,7 @@ def test_diagnosis_states_the_drift_in_its_report(fitted):
     errors = outcome.diagnosis.held_out
     assert errors["adapted"].position_m < 0.4 * errors["refit"].position_m
     assert outcome.figure_data.noise.adaptation is not None
-    report = completed(outcome.diagnosis)
+    report = outcome.diagnosis
     assert "In held-out recording 1 the car differs from the fitted recordings. The drive force is" in report.sentence
     (table,) = report.to_dict()["drift"]
     assert table["changes"][0]["value"] == pytest.approx(-0.3, abs=0.04)

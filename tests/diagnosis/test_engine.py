@@ -12,18 +12,15 @@ import pytest
 import carlab
 from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.proof.calibration import passes
-from carlab.benchmark.world.measurement import write_csv
 from carlab.cli import run
+from tests.helpers.case_files import write_case
 
 
 @pytest.fixture(scope="module")
 def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
     """Write 45 s to fit and 20 s held out with a concealed servo lag and base parameters wrong by up to 10 %."""
-    folder = tmp_path_factory.mktemp("concealed")
     case = make_case("single", 11, effects=("steering_lag",), excess=4.0, fit_s=45, hold_s=20)
-    write_csv(folder / "fit.csv", case.fit)
-    write_csv(folder / "hold.csv", case.hold)
-    case.nominal.write(folder / "car.toml")
+    folder = write_case(case, tmp_path_factory.mktemp("concealed"))
     return folder, case.answer()["effects"][0]["parameters"]["time_constant"]
 
 

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlab.benchmark.cases.case import Case, make_case
-from carlab.benchmark.world.measurement import read_csv, write_csv
-from carlab.cars import load_car_file
-from carlab.core.episode_data import EpisodeData
+from carlab.benchmark.cases.case import make_case
+from carlab.benchmark.world.measurement import read_csv
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
@@ -23,41 +21,27 @@ from carlab.diagnosis.unexplained.residual_terms import TERMS, responses
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
-from carlab.recording.csv.foreign import import_csv
 from sim_backends.effects import EFFECTS, confusable_effects
-
-Table = dict[str, np.ndarray]
-
-
-def episodes(path: Path, table: Table) -> list[EpisodeData]:
-    write_csv(path, table)
-    return list(import_csv(path).episodes)
-
-
-def write(folder: Path, case: Case) -> Path:
-    write_csv(folder / "fit.csv", case.fit)
-    write_csv(folder / "hold.csv", case.hold)
-    case.nominal.write(folder / "car.toml")
-    return folder
+from tests.helpers.case_files import Table, car_in, episodes_in, imported, write_case
 
 
 def outcome(folder: Path, change: Callable[[Table], Table] = dict, effects: tuple[str, ...] | None = None) -> Outcome:
-    fit, hold = (episodes(folder / f"_{name}", change(read_csv(folder / name))) for name in ("fit.csv", "hold.csv"))
-    return diagnose(fit, hold, load_car_file(folder / "car.toml").simulator, effects=effects)
+    fit, hold = (imported(change(read_csv(folder / name)), folder / f"_{name}") for name in ("fit.csv", "hold.csv"))
+    return diagnose(fit, hold, car_in(folder), effects=effects)
 
 
 @pytest.fixture(scope="module")
 def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
     """Aerodynamic drag concealed in 45 s of driving with wrong base parameters."""
     case = make_case("single", 21, effects=("aerodynamic_drag",), excess=2.0, fit_s=45, hold_s=20)
-    folder = write(tmp_path_factory.mktemp("drag"), case)
+    folder = write_case(case, tmp_path_factory.mktemp("drag"))
     return folder, case.answer()["effects"][0]["parameters"]["coefficient"]
 
 
 @pytest.fixture(scope="module")
 def windows(drag: tuple[Path, float]) -> PredictionWindows:
     """Return prediction windows of the drive with drag."""
-    return cut_windows(segments_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
+    return cut_windows(segments_of(episodes_in(drag[0] / "fit.csv")), 0.8, 0.5)
 
 
 def rigidly_moved(table: Table, angle: float = 2.1, shift: tuple[float, float] = (3.0, -5.0)) -> Table:
@@ -94,13 +78,13 @@ def test_diagnosis_is_deterministic(drag: tuple[Path, float]) -> None:
 def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -> None:
     folder = drag[0]
     table = read_csv(folder / "fit.csv")
-    car = load_car_file(folder / "car.toml").simulator
-    hold = episodes(tmp_path / "hold.csv", read_csv(folder / "hold.csv"))
+    car = car_in(folder)
+    hold = episodes_in(folder / "hold.csv")
     middle = len(table["t"]) // 2
     ranges = []
     for rows in (slice(None, middle), slice(middle, None)):
         half = {name: column[rows] for name, column in table.items()}
-        found = diagnose(episodes(tmp_path / "half.csv", half), hold, car, effects=CANDIDATES).diagnosis
+        found = diagnose(imported(half, tmp_path / "half.csv"), hold, car, effects=CANDIDATES).diagnosis
         assert [e.id for e in found.effects] == ["aerodynamic_drag"]
         ranges.append(found.effects[0].parameters["coefficient"])
     first, second = ranges
@@ -113,7 +97,7 @@ def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -
 )
 def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path, candidates: tuple[str, ...] | None) -> None:
     case = make_case("parameters", 31, fit_s=45, hold_s=20)
-    found = outcome(write(tmp_path, case), effects=candidates).diagnosis
+    found = outcome(write_case(case, tmp_path), effects=candidates).diagnosis
     assert found.verdict == "parameters"
     assert found.effects == ()
     assert found.held_out["refit"].score < 0.5 * found.held_out["nominal"].score
@@ -125,7 +109,7 @@ def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path, candidate
 def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, candidates: tuple[str, ...] | None) -> None:
     """A cable that pulls the rear of the car towards a point resembles no effect of the catalogue."""
     case = make_case("outside", 41, effects=("cable_pull",), excess=4.0, fit_s=45, hold_s=20)
-    found = outcome(write(tmp_path, case), effects=candidates).diagnosis
+    found = outcome(write_case(case, tmp_path), effects=candidates).diagnosis
     assert found.verdict == "unexplained"
     assert found.effects == ()
     assert found.unexplained is not None
@@ -146,7 +130,7 @@ def test_rival_physics_replaces_a_spurious_effect(
 ) -> None:
     """Without rivals the most similar effect of the catalogue is accepted."""
     case = make_case("outside", 43, effects=(concealed,), excess=1.5, fit_s=60, hold_s=30)
-    folder = write(tmp_path, case)
+    folder = write_case(case, tmp_path)
     result = outcome(folder)
     found = result.diagnosis
     assert found.effects == ()
@@ -160,10 +144,11 @@ def test_rival_physics_replaces_a_spurious_effect(
 def test_effect_without_gain_on_left_out_blocks_is_eliminated(
     drag: tuple[Path, float], windows: PredictionWindows
 ) -> None:
-    car = load_car_file(drag[0] / "car.toml").simulator
+    car = car_in(drag[0])
     floor = np.array([0.006, 0.006, 0.005, 0.015, 0.015, 0.04])
     problem = SearchProblem(car, windows, floor, floor, confusable_effects())
-    scale = Scale.of(prediction_errors(simulate_windows(windows, car), windows)[0], floor, 0.2)
+    whole = problem.scale_of(car)
+    scale = replace(whole, sigma=np.maximum(0.2 * whole.sigma, floor))
     named = ("aerodynamic_drag", "steering_asymmetry", "torque_steer")
     base = refit(problem, (), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale)
     remaining = eliminate(problem, refit(problem, named, base.fit, scale), RunControl())
@@ -174,7 +159,7 @@ def test_effect_without_gain_on_left_out_blocks_is_eliminated(
 
 def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float], windows: PredictionWindows) -> None:
     """The reference is a simulation with the drag -c v|v| / m."""
-    car = load_car_file(drag[0] / "car.toml").simulator
+    car = car_in(drag[0])
     scale = Scale(np.array([8, 16, 24]), np.ones((3, 6)))
     coefficient = 0.02
     plain = prediction_errors(simulate_windows(windows, car), windows)[0]
@@ -191,9 +176,9 @@ def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float],
 
 
 def test_one_step_without_a_fold_approximates_a_refit(drag: tuple[Path, float], windows: PredictionWindows) -> None:
-    car = with_effect(load_car_file(drag[0] / "car.toml").simulator, "aerodynamic_drag")
+    car = with_effect(car_in(drag[0]), "aerodynamic_drag")
     free = (*base_parameters(car), *effect_parameters("aerodynamic_drag", car))
-    noise = estimate_noise(segments_of(list(import_csv(drag[0] / "fit.csv").episodes)), windows.curvature_bias)
+    noise = estimate_noise(segments_of(episodes_in(drag[0] / "fit.csv")), windows.curvature_bias)
     fitter = Fitter(windows, Scale(np.array([8, 16, 24]), np.tile(3.0 * noise.measured, (3, 1))))
     fit = fitter.fit(car, free, iterations=30)
     folds = (windows.block // 2) % 3

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares, lsq_linear
 
 from carlab.diagnosis.evidence import ScoredSearch, estimate
 from carlab.diagnosis.identification.bounded_step import bounded_step, coordinate_bounds, inward_steps
-from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.error_scale import Scale, huber
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
@@ -17,13 +17,13 @@ from carlab.diagnosis.identification.fit_parameters import (
     effect_parameters,
     with_effect,
 )
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from tests.helpers.recorded_drives import drive
 
-PROBLEM = SimpleNamespace(settings=DEFAULT, windows=SimpleNamespace(block=np.arange(20)))
+PROBLEM = SimpleNamespace(windows=SimpleNamespace(block=np.arange(20)))
 EVERY_CASE = [(kind, effect) for kind in ("dynamic", "linear_tyre", "kinematic") for effect in sorted(EFFECTS)]
 
 
@@ -139,15 +139,14 @@ def test_fit_with_parameters_at_their_bounds_reaches_the_minimum_of_scipy():
         return np.concatenate([fitter.white(car, free, z[None])[0].ravel(), precision @ z])
 
     def loss(z):
-        return float(fitter.huber(fitter.white(car, free, z[None])).sum() + fitter.prior(free, z[None])[0])
+        return float(huber(fitter.white(car, free, z[None])).sum() + fitter.prior(free, z[None])[0])
 
     def jacobian(z):
         ends = [np.clip(z + sign * 0.01 * np.eye(len(z)), low, high) for sign in (1.0, -1.0)]
         changes = [residuals(a) - residuals(b) for a, b in zip(*ends, strict=True)]
         return np.stack(changes, axis=1) / np.diag(ends[0] - ends[1])
 
-    huber_delta = DEFAULT.identification.huber_delta
-    exact = least_squares(residuals, 0.0 * low, jacobian, (low, high), loss="huber", f_scale=huber_delta)
+    exact = least_squares(residuals, 0.0 * low, jacobian, (low, high), loss="huber", f_scale=IDENTIFICATION.huber_delta)
     at_bound = {"motor.drive_gain", "tyre.rear.C"}
     for start in (np.zeros(len(free)), np.full(len(free), 3.0), np.full(len(free), -3.0)):
         fit = fitter.fit(car, free, start)

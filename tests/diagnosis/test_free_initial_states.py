@@ -9,8 +9,6 @@ from scipy.optimize import least_squares
 
 import carlab
 from carlab.benchmark.cases.case import make_case
-from carlab.benchmark.world.measurement import write_csv
-from carlab.cars import load_car_file
 from carlab.diagnosis.identification.error_scale import Scale, huber
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
@@ -18,12 +16,12 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.naming import explained_share
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
-from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.case_files import car_in, episodes_in, write_case
 
 STD = np.array([1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.03])
 
@@ -31,12 +29,9 @@ STD = np.array([1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.03])
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatorConfig, PredictionWindows]:
     """Return a car, and 60 windows of its motion with white noise, their initial states wrong by three deviations."""
-    folder = tmp_path_factory.mktemp("drive")
-    case = make_case("null", 5, fit_s=40, hold_s=30)
-    write_csv(folder / "fit.csv", case.fit)
-    case.nominal.write(folder / "car.toml")
-    car = load_car_file(folder / "car.toml").simulator
-    windows = cut_windows(segments_of(list(import_csv(folder / "fit.csv").episodes)), 0.8, 0.5).thinned(60)
+    folder = write_case(make_case("null", 5, fit_s=40, hold_s=30), tmp_path_factory.mktemp("drive"))
+    car = car_in(folder)
+    windows = cut_windows(segments_of(episodes_in(folder / "fit.csv")), 0.8, 0.5).thinned(60)
     rng = np.random.default_rng(0)
     motion = simulate_windows(windows, car)[0]
     wrong = windows.initial_states + 3.0 * STD * rng.standard_normal((len(windows), 6))
@@ -70,7 +65,7 @@ def test_loss_is_the_minimum_over_initial_states(simulated: tuple[SimulatorConfi
             return np.stack([(errors_at(shift + step) - errors_at(shift)) / 0.1 for step in 0.1 * np.eye(6)], axis=1)
 
         loss = loss_of_free_initial_states(window, wrong, (), np.zeros((1, 0)), STD, max_error=1e4)[0]
-        delta = DEFAULT.identification.huber_delta
+        delta = IDENTIFICATION.huber_delta
         best = least_squares(errors_at, np.zeros(6), slopes_at, loss="huber", f_scale=delta, ftol=1e-6)
         assert best.cost < 0.5 * huber(errors_at(np.zeros(6))).sum()
         assert loss == pytest.approx(best.cost, rel=0.02)
@@ -96,14 +91,11 @@ def test_explained_share_is_the_excess_that_the_effects_remove(
 @pytest.mark.slow
 def test_delay_of_the_throttle_is_no_lag_of_the_motor(tmp_path: Path) -> None:
     """With fixed initial states, a bias of these in hard braking makes a lag as likely as the concealed delay."""
-    case = make_case("single", 10, effects=("throttle_delay",), excess=3.0, fit_s=60, hold_s=30)
-    write_csv(tmp_path / "fit.csv", case.fit)
-    write_csv(tmp_path / "hold.csv", case.hold)
-    case.nominal.write(tmp_path / "car.toml")
+    write_case(make_case("single", 10, effects=("throttle_delay",), excess=3.0, fit_s=60, hold_s=30), tmp_path)
     report = carlab.diagnose(
-        str(tmp_path / "fit.csv"),
-        str(tmp_path / "car.toml"),
-        held_out=str(tmp_path / "hold.csv"),
+        tmp_path / "fit.csv",
+        tmp_path / "car.toml",
+        held_out=tmp_path / "hold.csv",
         effects=("throttle_delay", "motor_lag"),
     )
     found = report.diagnosis.effects[0]

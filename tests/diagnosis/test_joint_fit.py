@@ -12,6 +12,7 @@ from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.joint_fit import joint_fit
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
@@ -50,13 +51,19 @@ def by_scipy(windows: PredictionWindows, fit: Fit) -> float:
     return float(least_squares(errors, start, jac=jacobian, method="lm", xtol=1e-10).x[0])
 
 
-def test_joint_fit_is_the_least_squares_fit_of_scipy() -> None:
+def change_settings(monkeypatch: pytest.MonkeyPatch, **values: float) -> None:
+    for module in ("error_scale", "joint_fit"):
+        monkeypatch.setattr(
+            f"carlab.diagnosis.identification.{module}.IDENTIFICATION", replace(IDENTIFICATION, **values)
+        )
+
+
+def test_joint_fit_is_the_least_squares_fit_of_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
     windows = cut_windows(segments_of([drive(TRUE, 8.0, 3)]), 0.8, 2.0)
     fitter, start = fitted(windows)
     start = replace(start, z=start.z - 0.1)
-    found = joint_fit(
-        Fitter(windows, SCALE, replace(fitter.settings, huber_delta=1e6, joint_max_noise_ratio=9.0)), start, STD
-    )
+    change_settings(monkeypatch, huber_delta=1e6, joint_max_noise_ratio=9.0)
+    found = joint_fit(fitter, start, STD)
     assert found is not None
     assert found.covariance is not None
     std = math.sqrt(found.covariance[0, 0])
@@ -65,15 +72,15 @@ def test_joint_fit_is_the_least_squares_fit_of_scipy() -> None:
     assert abs(start.z[0] - expected) > 5.0 * std
 
 
-def test_joint_fit_holds_a_parameter_at_its_bound() -> None:
+def test_joint_fit_holds_a_parameter_at_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     """The true lag is 0.05 s, and a car file that states 0.2 s allows at least 0.1 s."""
     windows = cut_windows(segments_of([drive(TRUE, 8.0, 3)]), 0.8, 2.0)
     fitter, start = fitted(windows)
     lag = replace(start.free[0], low=0.1)
     others = tuple(f for f in base_parameters(CAR) if f.name.startswith("motor."))
     start = fitter.fit(start.config, (lag, *others), np.array([lag.coordinate(0.15), 0.0, 0.0]))
-    lenient = replace(fitter.settings, joint_max_noise_ratio=math.inf)
-    found = joint_fit(Fitter(windows, SCALE, lenient), replace(start, z=start.z + np.array([0.5, 0.0, 0.0])), STD)
+    change_settings(monkeypatch, joint_max_noise_ratio=math.inf)
+    found = joint_fit(fitter, replace(start, z=start.z + np.array([0.5, 0.0, 0.0])), STD)
     assert found is not None
     assert found.covariance is not None
     assert found.z[0] == lag.coordinate(0.1)

@@ -15,13 +15,13 @@ from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
 from sim_backends.effects import CATALOGUE
-from tests.diagnosis.report_material import no_mismatch
+from tests.diagnosis.report_material import changed, no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
@@ -64,7 +64,7 @@ def test_limits_agree_with_fits_of_the_effect(
     assert fit.covariance is not None
     for name, limit in limits[effect].items():
         k = [f.name for f in fit.free].index(f"effects.{effect}.{name}")
-        std = DEFAULT.evidence.interval_factor * fit.free[k].size * np.sqrt(fit.covariance[k, k])
+        std = EVIDENCE.interval_factor * fit.free[k].size * np.sqrt(fit.covariance[k, k])
         assert limit.std == pytest.approx(std, rel=0.35)
         assert limit.value == pytest.approx(fit.config.values()[fit.free[k].name], abs=0.5 * std)
         assert limit.low90 <= limit.value <= limit.high90
@@ -73,7 +73,7 @@ def test_limits_agree_with_fits_of_the_effect(
 def test_limits_are_wider_where_the_model_errs(correct: ScoredSearch, limits: dict[str, dict[str, Estimate]]) -> None:
     """By the factors on standard errors; the size at which a slope is taken grows too, so not exactly."""
     std = effect_limits(replace(correct, excess=1.0), FunctionWorkers())["steering_lag"]["time_constant"].std
-    factors = DEFAULT.evidence.model_interval_factor / DEFAULT.evidence.interval_factor
+    factors = EVIDENCE.model_interval_factor / EVIDENCE.interval_factor
     assert std == pytest.approx(factors * limits["steering_lag"]["time_constant"].std, rel=0.1)
     assert factors > 1.2
 
@@ -111,7 +111,7 @@ def test_effects_without_a_linear_estimate_are_omitted(limits: dict[str, dict[st
 
 
 def test_report_states_the_narrowest_limits(limits: dict[str, dict[str, Estimate]]) -> None:
-    diagnosis = replace(no_mismatch(), sentence="", limits=limits)
+    diagnosis = changed(no_mismatch(), limits=limits)
     sentence = verdict_sentence(diagnosis)
     assert "for example" not in verdict_sentence(replace(diagnosis, limits={}))
     typical = {e: CATALOGUE[e].parameters[0].typical for e, own in limits.items() if len(own) == 1}

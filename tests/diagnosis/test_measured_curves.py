@@ -22,13 +22,13 @@ from carlab.diagnosis.report.sentences import with_unit
 from carlab.diagnosis.report.write import write_report
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
-from carlab.diagnosis.settings import DEFAULT, CurveSettings
+from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION, CurveSettings
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
 from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter
-from tests.diagnosis.report_material import no_mismatch
+from tests.diagnosis.report_material import changed, no_mismatch
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
@@ -145,10 +145,9 @@ def test_penalty_of_a_curve_is_that_of_its_roughness():
     z = np.zeros((1, len(free)))
     own = [k for k, f in enumerate(free) if f.name.startswith("effects.front_tyre_map.")]
     z[0, own] = np.random.default_rng(0).normal(size=len(own))
-    settings = DEFAULT.identification
     bends = EFFECTS["front_tyre_map"].roughness() @ z[0, own]
-    expected = 0.5 * (bends**2).sum() / settings.curve_roughness_std**2
-    expected += 0.5 * (z[0, own] ** 2).sum() / settings.curve_std**2
+    expected = 0.5 * (bends**2).sum() / IDENTIFICATION.curve_roughness_std**2
+    expected += 0.5 * (z[0, own] ** 2).sum() / IDENTIFICATION.curve_std**2
     assert fitter.prior(free, z)[0] == pytest.approx(expected)
 
 
@@ -177,7 +176,7 @@ def finding(measured, std=0.05):
 def test_readings_of_a_controller_that_holds_a_speed():
     axes = EFFECTS["drive_map"].axes
     throttle, speed = np.meshgrid(*(a.knots for a in axes), indexing="ij")
-    sentences = readings_of_drive(finding(controller_acceleration(throttle, speed)), DEFAULT.report)
+    sentences = readings_of_drive(finding(controller_acceleration(throttle, speed)))
     assert any("With the throttle released, the motor brakes with 2 to 4 m/s²" in s for s in sentences)
     assert any("0.3 m/s at throttle 0.1" in s for s in sentences)
     assert any("saturates" in s for s in sentences)
@@ -187,9 +186,9 @@ def test_readings_of_the_car_file_itself_are_empty(outcome):
     axes = EFFECTS["drive_map"].axes
     throttle, speed = np.meshgrid(*(a.knots for a in axes), indexing="ij")
     same = finding(5.0 * throttle - speed)
-    assert readings_of_drive(same, DEFAULT.report) == []
+    assert readings_of_drive(same) == []
     braking = finding(5.0 * throttle - speed - 0.6 * speed * (throttle == 0.0))  # a motor that brakes while coasting
-    assert [s.partition(",")[0] for s in readings_of_drive(braking, DEFAULT.report)] == ["With the throttle released"]
+    assert [s.partition(",")[0] for s in readings_of_drive(braking)] == ["With the throttle released"]
     assert curve_sentences(replace(outcome.diagnosis, curves=())) == []
 
 
@@ -227,7 +226,7 @@ def test_curve_that_the_recordings_do_not_need_is_rejected_with_its_test():
     ],
 )
 def test_report_states_why_curves_are_not_accepted(trial, expected):
-    without = replace(no_mismatch(), sentence="", curve_trial=trial)
+    without = changed(no_mismatch(), curve_trial=trial)
     assert curve_sentences(without) == [expected]
     page = render_page(without, FigureData())
     assert expected.replace("'", "&#39;") in page

@@ -12,11 +12,10 @@ import pytest
 
 from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.world.driver import HumanDriver, Track
-from carlab.benchmark.world.measurement import Noise, as_table, record, write_csv
+from carlab.benchmark.world.measurement import Noise, as_table, record
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive as SimulatedDrive
 from carlab.benchmark.world.simulation import drive as simulated_drive
-from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
@@ -25,8 +24,8 @@ from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of
-from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.case_files import car_in, episodes_in, imported, write_case
 
 SEEDS = (61, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (62, 63)))
 
@@ -49,11 +48,8 @@ class Drive:
 
 
 def drive(folder: Path, case: Case) -> Drive:
-    write_csv(folder / "fit.csv", case.fit)
-    write_csv(folder / "hold.csv", case.hold)
-    case.nominal.write(folder / "car.toml")
-    segments = segments_of(list(import_csv(folder / "fit.csv").episodes))
-    return Drive(case, folder, segments, load_car_file(folder / "car.toml").simulator)
+    write_case(case, folder)
+    return Drive(case, folder, segments_of(episodes_in(folder / "fit.csv")), car_in(folder))
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -129,8 +125,8 @@ def test_velocity_window_is_estimated(
     """A drive at 120 Hz is differentiated by parabolas over a window; the variance is width^2 / 20."""
     car, (world, driven) = plain.case.true_car, finely_driven
     noise = Noise(car.position_std, car.yaw_std, window_s)
-    write_csv(tmp_path / "drive.csv", as_table(record(driven, world, noise, np.random.default_rng(7))))
-    windows = cut_windows(segments_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
+    table = as_table(record(driven, world, noise, np.random.default_rng(7)))
+    windows = cut_windows(segments_of(imported(table, tmp_path / "drive.csv")), 0.8, 0.3)
     assert np.sqrt(20.0 * velocity_window_variance_s2(windows, plain.nominal)) == pytest.approx(window_s, abs=0.025)
 
 
@@ -167,7 +163,7 @@ def test_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, fixed_freque
     "effects", [("aerodynamic_drag", "velocity_filter_lag", "yaw_damping"), pytest.param(None, marks=pytest.mark.slow)]
 )
 def test_vibration_is_described_without_an_effect(shaking: Drive, effects: tuple[str, ...] | None) -> None:
-    fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
+    fit, hold = (episodes_in(shaking.folder / name) for name in ("fit.csv", "hold.csv"))
     found = diagnose(fit, hold, shaking.nominal, effects=effects).diagnosis
     assert found.verdict == "unexplained"
     assert found.unexplained is not None

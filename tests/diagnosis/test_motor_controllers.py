@@ -10,9 +10,9 @@ from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import Noise, record
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import drive
-from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import diagnose
+from tests.helpers.case_files import car_in
 
 pytestmark = pytest.mark.timeout(900)
 CAR = BaseCar()
@@ -48,9 +48,8 @@ def recorded(effect: str, seed: int, duration_s: float) -> EpisodeData:
 @pytest.mark.parametrize("effect", CONCEALED)
 def test_concealed_effect_of_the_motor_controller_is_named_with_its_numbers(effect: str, tmp_path: Path) -> None:
     CAR.write(tmp_path / "car.toml")
-    nominal = load_car_file(tmp_path / "car.toml").simulator
     fit, held_out = recorded(effect, 1, 30.0), recorded(effect, 2, 12.0)
-    found = diagnose([fit], [held_out], nominal, effects=CANDIDATES).diagnosis
+    found = diagnose([fit], [held_out], car_in(tmp_path), effects=CANDIDATES).diagnosis
     assert [e.id for e in found.effects] == [effect]
     for name, value in CONCEALED[effect].items():
         assert found.effects[0].parameters[name].value == pytest.approx(value, rel=0.1), name

@@ -16,7 +16,7 @@ from carlab.core.state_estimator import fit_velocity
 from carlab.diagnosis.quick.conditions import find_conditions
 from carlab.diagnosis.quick.quick_check import QuickCheck, quick_check
 from carlab.diagnosis.quick.sentences import sentences, short
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import QUICK
 from carlab.diagnosis.state_alignment import align_states, window_variance_s2
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.mcap.source import read_episode
@@ -37,7 +37,7 @@ def test_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -> No
         check = quick_check(episodes[:count], SIMULATOR)
         assert check.verdict == "explains", check
         assert check.causes == ()
-        assert 0.5 < check.score < DEFAULT.quick.score_max
+        assert 0.5 < check.score < QUICK.score_max
     assert "explains" in sentences(check)[0]
 
 
@@ -135,7 +135,7 @@ def test_outlier_in_one_episode_is_undecided(tmp_path: Path) -> None:
     poses[:, 2] += 0.1 * np.clip((poses[:, 0] - pushed.times_s[40]) / 0.4, 0.0, 1.0)
     episodes[index] = replace(pushed, states=moved, poses=poses)
     check = quick_check(episodes, SIMULATOR)
-    assert check.score > DEFAULT.quick.score_max
+    assert check.score > QUICK.score_max
     assert check.verdict == "undecided"
     assert "outlier" in check.why
 

@@ -7,13 +7,13 @@ from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.fit_parameters import effect_parameters, with_effect
 from carlab.diagnosis.selection.screening import Screen, size_of_change
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import SCREENING
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
-WANTED = DEFAULT.screening.error_rms_changes
-EXPONENTS = DEFAULT.screening.probe_exponents
+WANTED = SCREENING.error_rms_changes
+EXPONENTS = SCREENING.probe_exponents
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
@@ -55,7 +55,7 @@ def test_points_change_the_errors_as_wanted(screen: Screen, effect: str) -> None
     free = effect_parameters(effect, screen.config)
     points = screen.points(effect, free)
     white = screen.fitter.white(with_effect(screen.config, effect), free, points)
-    limit = DEFAULT.screening.max_whitened_change
+    limit = SCREENING.max_whitened_change
     change = np.sqrt(np.mean((white - screen.white.reshape(white.shape[1:])).clip(-limit, limit) ** 2, axis=(1, 2, 3)))
     expected = np.resize(WANTED, len(points))
     assert np.abs(np.log(change / expected)).max() < np.log(2.5)

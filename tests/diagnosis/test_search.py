@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 
 from carlab.benchmark.cases.case import Case, make_case
-from carlab.benchmark.world.measurement import write_csv
-from carlab.cars import load_car_file
 from carlab.core.clock import SimulatedClock
-from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.findings import SearchExtent
 from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.forward import Path as SelectionPath
@@ -27,12 +23,11 @@ from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import cut_windows, segments_of
-from carlab.recording.csv.foreign import import_csv
 from sim_backends import SimulatorConfig
 from sim_backends.effects import CATALOGUE
+from tests.helpers.case_files import car_in, imported, turned, write_case
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
-Table = dict[str, np.ndarray]
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
 """A quarter of the windows of the default. They do not overlap."""
 HALF = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
@@ -67,13 +62,6 @@ def long_drag() -> Case:
     return make_case("single", 21, effects=(DRAG,), excess=2.0, fit_s=60, hold_s=30)
 
 
-def turned(table: Table, angle: float) -> Table:
-    """Return the same drive measured by a camera system that sees the car turned by ``angle`` [rad]."""
-    sin, cos = np.sin(angle), np.cos(angle)
-    vx, vy = table["vx"], table["vy"]
-    return table | {"yaw": table["yaw"] + angle, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}
-
-
 @pytest.fixture(autouse=True)
 def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search two effects only, because the whole catalogue takes long."""
@@ -88,12 +76,10 @@ def found(
     **options: Any,
 ) -> Outcome:
     """Diagnose a case, measured with misalignments [rad] of the fitted and the held-out recording."""
-    read: list[list[EpisodeData]] = []
-    for table, angle in zip((case.fit, case.hold), angles, strict=True):
-        write_csv(folder / "drive.csv", turned(table, angle))
-        read.append(list(import_csv(folder / "drive.csv").episodes))
-    case.nominal.write(folder / "car.toml")
-    return diagnose(*read, load_car_file(folder / "car.toml").simulator, settings=settings, **options)
+    write_case(case, folder)
+    fit = imported(turned(case.fit, angles[0]), folder / "fit.csv")
+    hold = imported(turned(case.hold, angles[1]), folder / "hold.csv")
+    return diagnose(fit, hold, car_in(folder), settings=settings, **options)
 
 
 def names(outcome: Outcome) -> list[str]:
@@ -155,7 +141,7 @@ def test_time_limit_ends_the_search_with_a_valid_report(drag: Case, tmp_path: Pa
     assert outcome.diagnosis.effects == ()
     held_out = outcome.diagnosis.held_out
     assert held_out["refit"].score < held_out["nominal"].score
-    assert "cut short by the time limit of 0.001 s" in completed(outcome.diagnosis).sentence
+    assert "cut short by the time limit of 0.001 s" in outcome.diagnosis.sentence
     extent = {"is_complete": False, "stopped_by": "budget", "budget_s": 1e-3, "effects": [], "omitted": []}
     assert outcome.diagnosis.to_dict()["search"] == extent
 

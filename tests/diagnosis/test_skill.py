@@ -1,14 +1,12 @@
 """The comparison with constant velocity against closed forms, and the noise floor of a recording."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.report.sentences import worse_than_constant_velocity
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE
 from carlab.diagnosis.skill import skill_of
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import ConstantVelocity, NoChange
@@ -35,18 +33,18 @@ def circle(seconds: float) -> EpisodeData:
 def test_a_standing_prediction_errs_by_the_chord_of_a_circle() -> None:
     windows = cut_windows(segments_of([circle(30.0), circle(30.0)]), 1.0, 0.25)
     standing, constant = (final_errors(model, windows) for model in (NoChange(), ConstantVelocity()))
-    rows = skill_of(windows, standing, constant, DEFAULT.evidence)
+    rows = skill_of(windows, standing, constant)
     chord_m = 2.0 * RADIUS_M * np.sin(0.5 * YAW_RATE * windows.horizon_s)
     assert {(r.recording, r.regime) for r in rows} >= {(1, "all"), (2, "steady commands"), (2, "changing commands")}
     for row in rows:
         assert row.model_m == pytest.approx(chord_m, rel=1e-3)
         assert row.constant_velocity_m == pytest.approx(0.0, abs=1e-3)
         assert row.travelled_m == pytest.approx(RADIUS_M * YAW_RATE * windows.horizon_s, rel=1e-3)
-        assert row.standard_errors < -DEFAULT.evidence.skill_z_min
-    swapped = skill_of(windows, constant, standing, DEFAULT.evidence)
-    assert all(row.standard_errors > DEFAULT.evidence.skill_z_min for row in swapped)
-    few = replace(DEFAULT.evidence, skill_windows_min=len(windows))
-    assert skill_of(windows, standing, constant, few) == ()
+        assert row.standard_errors < -EVIDENCE.skill_z_min
+    swapped = skill_of(windows, constant, standing)
+    assert all(row.standard_errors > EVIDENCE.skill_z_min for row in swapped)
+    few = np.arange(EVIDENCE.skill_windows_min - 1)
+    assert skill_of(windows.take(few), standing[few], constant[few]) == ()
 
 
 def test_the_floor_depends_on_recording_and_car_file_alone() -> None:

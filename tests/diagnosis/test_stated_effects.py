@@ -7,24 +7,22 @@ import numpy as np
 import pytest
 
 from carlab.benchmark.cases.case import Case, make_case
-from carlab.benchmark.world.measurement import write_csv
-from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, Estimate, Evidence
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.report.next_drive import with_texts
 from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
-from carlab.diagnosis.report.write import completed, with_parameter_std
+from carlab.diagnosis.report.write import with_parameter_std
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
-from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
+from tests.helpers.case_files import car_in, imported, turned
 
-Table = dict[str, np.ndarray]
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
 """A quarter of the windows of the default."""
 MISALIGNMENT = "mocap_yaw_misalignment"
@@ -39,13 +37,12 @@ def case() -> Case:
 @pytest.fixture
 def nominal(case: Case, tmp_path: Path) -> SimulatorConfig:
     case.nominal.write(tmp_path / "car.toml")
-    return load_car_file(tmp_path / "car.toml").simulator
+    return car_in(tmp_path)
 
 
 @pytest.fixture
 def windows(case: Case, tmp_path: Path) -> PredictionWindows:
-    write_csv(tmp_path / "drive.csv", case.fit)
-    segments = segments_of(import_csv(tmp_path / "drive.csv").episodes)
+    segments = segments_of(imported(case.fit, tmp_path / "drive.csv"))
     return cut_windows(segments, DEFAULT.windows.fit_window_s, 2.0, DEFAULT.windows.fit_window_s)
 
 
@@ -56,19 +53,9 @@ def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", few)
 
 
-def rotated(table: Table, angle_rad: float) -> Table:
-    """The same drive measured by a camera system with a yaw misalignment [rad]."""
-    sin, cos = np.sin(angle_rad), np.cos(angle_rad)
-    vx, vy = table["vx"], table["vy"]
-    return table | {"yaw": table["yaw"] + angle_rad, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}
-
-
 def diagnosed(case: Case, folder: Path, nominal: SimulatorConfig, angle_rad: float, stated_rad: float) -> Outcome:
     """Diagnose drives with a yaw misalignment, of which the car file states another value."""
-    read = []
-    for table in (case.fit, case.hold):
-        write_csv(folder / "drive.csv", rotated(table, angle_rad))
-        read.append(list(import_csv(folder / "drive.csv").episodes))
+    read = (imported(turned(table, angle_rad), folder / "drive.csv") for table in (case.fit, case.hold))
     stated = replace(nominal, effects={MISALIGNMENT: {"angle": stated_rad}})
     return diagnose(*read, stated, settings=FEWER)
 
@@ -82,7 +69,7 @@ def test_wrong_number_of_a_stated_effect_is_named(case: Case, tmp_path: Path, no
     assert effect.sentence.startswith("Wrong in the car file: ")
     assert effect.sentence.endswith("not 0.02 rad.")
     assert outcome.model.effects[MISALIGNMENT]["angle"] == effect.parameters["angle"].value
-    report = completed(outcome.diagnosis).to_dict()
+    report = outcome.diagnosis.to_dict()
     assert report["effects"][0]["car_file_values"] == {"angle": 0.02}
     assert report["sentence"].startswith("One effect of the car file has wrong numbers: ")
     assert " With corrected numbers, the position error " in report["sentence"]
@@ -123,7 +110,7 @@ def test_standard_deviation_of_the_car_file_is_that_of_the_prior(nominal: Simula
     name = "motor.drive_gain"
     value = nominal.values()[name]
     known = replace(nominal, parameter_std={name: 0.04 * value})
-    change_share = DEFAULT.identification.prior_change_share
+    change_share = IDENTIFICATION.prior_change_share
     (before,), (after,) = ([f for f in base_parameters(c, uses_std=True) if f.name == name] for c in (nominal, known))
     at_one_std = [float(f.value(np.array(f.prior_z))) for f in (before, after)]
     assert at_one_std[1] == pytest.approx(value * np.exp(np.hypot(0.04, change_share)))
@@ -221,11 +208,9 @@ def test_requested_effect_that_increases_the_held_out_error_is_withdrawn(
     The base parameters are known, so that a refit does not imitate the misalignment.
     """
     known = replace(nominal, parameter_std={f.name: 0.01 * f.origin for f in base_parameters(nominal) if f.logarithmic})
-    read = []
-    for table, angle_rad in ((case.fit, 0.06), (case.hold, -0.06 if is_opposite else 0.06)):
-        write_csv(tmp_path / "drive.csv", rotated(table, angle_rad))
-        read.append(list(import_csv(tmp_path / "drive.csv").episodes))
-    outcome = diagnose(*read, known, settings=FEWER, effects=(MISALIGNMENT,))
+    fit = imported(turned(case.fit, 0.06), tmp_path / "fit.csv")
+    hold = imported(turned(case.hold, -0.06 if is_opposite else 0.06), tmp_path / "hold.csv")
+    outcome = diagnose(fit, hold, known, settings=FEWER, effects=(MISALIGNMENT,))
     assert [effect.id for effect in outcome.diagnosis.effects] == ([] if is_opposite else [MISALIGNMENT])
 
 
@@ -241,6 +226,6 @@ def test_sentence_counts_missing_and_wrong_effects_apart() -> None:
         "The simulator leaves out one effect: a lag of the steering servo. "
         "One effect of the car file has wrong numbers: a lag of the motor."
     )
-    assert completed(diagnosis).effects[1].sentence == (
+    assert with_texts(diagnosis).effects[1].sentence == (
         "Wrong in the car file: a lag of the motor: time_constant is 0.11 s (0.1 to 0.12 at 90 %), not 0.05 s."
     )

@@ -9,15 +9,13 @@ import pytest
 from carlab.benchmark.cases.case import Case, CaseKind, make_case
 from carlab.benchmark.effects.catalogue import FormName
 from carlab.benchmark.effects.random_physics import MonotoneMap
-from carlab.benchmark.world.measurement import write_csv
-from carlab.cars import load_car_file
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.settings import DEFAULT
-from carlab.recording.csv.foreign import import_csv
 from sim_backends import EFFECTS, SimulatorConfig
 from sim_backends.array_ops import ARRAYS
 from sim_backends.effects import CATALOGUE, MeasuredCurve
+from tests.helpers.case_files import car_in, episodes_in, write_case
 
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
 """Half as many windows as by default. They overlap less, so they have nearly as much information."""
@@ -32,11 +30,9 @@ def made(kind: CaseKind, effect: str, form: FormName) -> Case:
 def found(case: Case, folder: Path, candidates: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> Outcome:
     """Diagnose a case with few candidates, because the whole catalogue takes long."""
     monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", {name: CATALOGUE[name] for name in candidates})
-    write_csv(folder / "fit.csv", case.fit)
-    write_csv(folder / "hold.csv", case.hold)
-    case.nominal.write(folder / "car.toml")
-    read = [list(import_csv(folder / name).episodes) for name in ("fit.csv", "hold.csv")]
-    return diagnose(*read, load_car_file(folder / "car.toml").simulator, settings=FEWER)
+    write_case(case, folder)
+    fit, hold = episodes_in(folder / "fit.csv"), episodes_in(folder / "hold.csv")
+    return diagnose(fit, hold, car_in(folder), settings=FEWER)
 
 
 def decisions_by(outcome: Outcome, setting: str) -> list[Decision]:

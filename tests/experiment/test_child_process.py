@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 
 from carlab.experiment.campaign.child_process import child_context, interrupts_blocked, run_in_child
+from tests.helpers.waiting import until
 
 CHILD = """
 import signal
@@ -109,9 +110,13 @@ def test_stop_does_not_wait_for_the_imports_of_the_server(tmp_path: Path) -> Non
         "print(child_process.run_in_child('root', math.sqrt, (4.0,), stop))\n"
         "print(child_process.run_in_child('root', math.sqrt, (4.0,), lambda: False))\n"
     )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     ended = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=50.0
+        [sys.executable, "-c", script],
+        env=_with_path(tmp_path),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=50.0,
     )
     assert (ended.returncode, ended.stdout) == (0, "None\n2.0\n"), ended.stderr
 
@@ -143,3 +148,32 @@ def test_stop_returns_if_the_other_thread_has_seen_the_end_of_the_server(monkeyp
 
     monkeypatch.setattr(os, "waitid", after_the_other_thread)
     assert run_in_child("root", math.sqrt, (4.0,), lambda: True) is None
+
+
+def _with_path(folder: Path) -> dict[str, str]:
+    """The environment in which a new Python finds the modules of a folder too."""
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+
+
+SLEEPER = """
+import os, time
+def sleep(report):
+    report(os.getpid())
+    time.sleep(1000.0)
+"""
+PARENT = """
+import sleeper
+from carlab.experiment.campaign.child_process import run_in_child
+run_in_child("sleeper", sleeper.sleep, (), lambda: False, on_report=lambda pid: print(pid, flush=True))
+"""
+
+
+def test_child_ends_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
+    command = [sys.executable, "-c", PARENT]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=tmp_path, env=_with_path(tmp_path)) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        os.kill(child, 0)
+        parent.kill()
+    until(lambda: not Path(f"/proc/{child}").exists())

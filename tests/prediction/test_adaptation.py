@@ -8,7 +8,6 @@ import pytest
 from carlab.core.recording_noise import AdaptationNoise
 from carlab.prediction.adaptation import adapt, choose_noise
 from carlab.prediction.adaptation_filter import MeasuredWindows, Processes, run_filter
-from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import DISTURBANCE_NAMES, linearised
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel, simulate_windows
@@ -157,8 +156,8 @@ def test_jacobian_and_values_of_each_window_equal_single_simulations():
         )
         assert np.allclose(together[k], alone[0, 0], atol=1e-5)
     at = np.zeros((1, len(windows), 4))
-    measured = linearised(windows, CONFIG, at, AdaptationSettings())
+    measured = linearised(windows, CONFIG, at)
     at[..., 1] = 0.02
-    moved = linearised(windows, CONFIG, at, AdaptationSettings())
+    moved = linearised(windows, CONFIG, at)
     change = moved.error - measured.error
     assert np.allclose(change, 0.02 * measured.jacobian[..., 1], atol=0.15 * np.abs(change).max())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from carlab.prediction.adaptation import adapt, choose_noise
-from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.adaptation_settings import ADAPTATION
 from carlab.prediction.errors import final_errors
 from carlab.prediction.local_error_model import _weights
 from carlab.prediction.predict import SimulatorModel
@@ -19,27 +19,25 @@ CONFIG = SimulatorConfig(control_period_s=PERIOD_S)
 
 def test_weights_give_the_posterior_mean_of_known_windows():
     """With at most ``local_neighbours`` known windows the local process is the whole one."""
-    settings = AdaptationSettings()
     rng = np.random.default_rng(0)
     states, past = rng.normal(size=(5, 7)), rng.normal(size=(25, 7))
     known = rng.uniform(size=(5, 25)) < 0.6
     errors = rng.normal(size=25)
 
     def kernel(a, b):
-        return np.exp(-0.5 * ((a[:, None] - b[None]) ** 2).sum(axis=-1) / settings.local_length**2)
+        return np.exp(-0.5 * ((a[:, None] - b[None]) ** 2).sum(axis=-1) / ADAPTATION.local_length**2)
 
-    found = _weights(states, past, known, settings) @ errors
+    found = _weights(states, past, known) @ errors
     for k in range(5):
         own = past[known[k]]
-        total = kernel(own, own) + settings.local_noise * np.eye(len(own))
+        total = kernel(own, own) + ADAPTATION.local_noise * np.eye(len(own))
         assert found[k] == pytest.approx(kernel(states[k : k + 1], own)[0] @ np.linalg.solve(total, errors[known[k]]))
 
 
 def test_no_past_and_distant_states_give_no_correction():
-    settings = AdaptationSettings()
     past = np.zeros((40, 7))
-    assert np.all(_weights(np.zeros((1, 7)), past, np.zeros((1, 40), dtype=bool), settings) == 0.0)
-    assert np.all(np.abs(_weights(np.full((1, 7), 20.0), past, np.ones((1, 40), dtype=bool), settings)) < 1e-12)
+    assert np.all(_weights(np.zeros((1, 7)), past, np.zeros((1, 40), dtype=bool)) == 0.0)
+    assert np.all(np.abs(_weights(np.full((1, 7), 20.0), past, np.ones((1, 40), dtype=bool))) < 1e-12)
 
 
 @pytest.mark.parametrize("with_fitted", [False, True])

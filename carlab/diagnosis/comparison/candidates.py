@@ -18,7 +18,7 @@ from carlab.diagnosis.identification.fit_parameters import (
 )
 from carlab.diagnosis.selection.problem import is_applicable
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import DiagnosisSettings
+from carlab.diagnosis.settings import COMPARISON, SCREENING
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
 
@@ -45,11 +45,11 @@ class CandidatePoints:
     z0: FloatArray
     points: FloatArray
 
-    def secants(self, fitter: Fitter, errors: FloatArray, max_secant: float) -> FloatArray:
+    def secants(self, fitter: Fitter, errors: FloatArray) -> FloatArray:
         """Changes (P, S, D) of the whitened errors (S, D) from ``z0`` to each point."""
         moved = fitter.white(self.config, self.candidate.free, self.points)
         changes = moved.reshape(len(self.points), *errors.shape) - errors
-        return np.asarray(changes.clip(-max_secant, max_secant))
+        return np.asarray(changes.clip(-COMPARISON.max_secant, COMPARISON.max_secant))
 
 
 def change_candidates(config: SimulatorConfig, only: Sequence[str] | None = None) -> list[ChangeCandidate]:
@@ -69,9 +69,7 @@ def with_candidate(config: SimulatorConfig, candidate: ChangeCandidate) -> Simul
     return with_effect(config, candidate.id) if is_new else config
 
 
-def candidate_points(
-    fitter: Fitter, config: SimulatorConfig, candidate: ChangeCandidate, settings: DiagnosisSettings
-) -> CandidatePoints:
+def candidate_points(fitter: Fitter, config: SimulatorConfig, candidate: ChangeCandidate) -> CandidatePoints:
     """Points of a candidate: of an absent effect as in a screening, of a known parameter one step to both sides."""
     whole = with_candidate(config, candidate)
     values = whole.values()
@@ -80,13 +78,13 @@ def candidate_points(
         steps = np.vstack([np.eye(len(z0)), -np.eye(len(z0))])
         return CandidatePoints(candidate, whole, z0, z0 + steps)
     screening = replace(
-        settings.screening,
-        error_rms_changes=settings.comparison.error_rms_changes,
-        typical_size_ratios=settings.comparison.typical_size_ratios,
+        SCREENING,
+        error_rms_changes=COMPARISON.error_rms_changes,
+        typical_size_ratios=COMPARISON.typical_size_ratios,
     )
     screen = Screen(fitter, config, Fit(config, (), np.zeros(0), 0.0, np.zeros(0)), settings=screening)
     points = screen.points(candidate.id, candidate.free)
-    chosen = np.unique(np.linspace(0, len(points) - 1, settings.comparison.max_points).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(points) - 1, COMPARISON.max_points).round().astype(int))
     return CandidatePoints(candidate, whole, z0, points[chosen])
 
 

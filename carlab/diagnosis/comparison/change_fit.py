@@ -10,8 +10,8 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_model import ErrorModel
 from carlab.diagnosis.identification.fit import MAX_STEP, Fitter
-from carlab.diagnosis.identification.fit_parameters import FitParameter
-from carlab.diagnosis.settings import ComparisonSettings
+from carlab.diagnosis.identification.fit_parameters import FitParameter, numbers_at
+from carlab.diagnosis.settings import COMPARISON
 from sim_backends.car_parameters import SimulatorConfig
 
 DAMPINGS = (0.0, 0.1, 1.0, 10.0, 100.0)
@@ -43,9 +43,7 @@ class ChangeFit:
     @property
     def fitted(self) -> SimulatorConfig:
         """The simulator with the fitted parameters."""
-        return self.config.with_values({
-            f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)
-        })  # fmt: skip
+        return self.config.with_values(numbers_at(self.free, self.z))
 
 
 def fit_change(
@@ -55,7 +53,6 @@ def fit_change(
     starts: FloatArray,
     model: ErrorModel,
     offset: FloatArray,
-    settings: ComparisonSettings,
 ) -> ChangeFit:
     """Fit parameters to the second group.
 
@@ -66,7 +63,6 @@ def fit_change(
         starts: (P, n) initial points; the first is the value of the reference model, whose loss counts as before.
         model: distribution of the errors.
         offset: (S, D) decorrelated error that both groups have along the candidate; added to the errors.
-        settings: settings of the comparison.
     """
 
     def errors_at(z: FloatArray) -> FloatArray:
@@ -78,7 +74,7 @@ def fit_change(
     best = int(np.argmin(losses))
     z, errors, loss, before = starts[best], first[best], float(losses[best]), float(losses[0])
     jacobian = _jacobian(errors_at, free, z)
-    for _ in range(settings.iterations):
+    for _ in range(COMPARISON.iterations):
         weight = model.weights(errors)[:, None]
         normal = np.einsum("nsd,msd->nm", jacobian * weight, jacobian)
         gradient = np.einsum("nsd,sd->n", jacobian, weight * errors)
@@ -94,7 +90,7 @@ def fit_change(
             break
         z, errors, loss = _within(free, tried)[best], whole[best], float(losses[best])
         jacobian = _jacobian(errors_at, free, z)
-        if gain < settings.tolerance * loss:
+        if gain < COMPARISON.tolerance * loss:
             break
     weighted = jacobian * model.weights(errors)[None, :, None]
     covariance = np.asarray(np.linalg.pinv(np.einsum("nsd,msd->nm", weighted, jacobian)))

@@ -34,7 +34,7 @@ from carlab.diagnosis.comparison.result import Change, Comparison, ComparisonVer
 from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.gains import clustered_gain
-from carlab.diagnosis.settings import DEFAULT, ComparisonSettings, DiagnosisSettings
+from carlab.diagnosis.settings import COMPARISON
 from carlab.diagnosis.state_alignment import naming_lost_frames
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.registry import REGISTRY
@@ -57,7 +57,6 @@ def compare(
     nominal: SimulatorConfig,
     *,
     candidates: Sequence[str] | None = None,
-    settings: DiagnosisSettings = DEFAULT,
     progress: Callable[[str, float], None] = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Comparison:
@@ -68,7 +67,6 @@ def compare(
         changed: recordings of the second group.
         nominal: the simulator of the car file, best that of a diagnosis; its base parameters are refitted.
         candidates: effects and base parameters that may differ; all by default.
-        settings: settings of all stages.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the changes so far are the result.
 
@@ -78,9 +76,9 @@ def compare(
     began_s = MonotonicClock().now_s()
     progress("fitting the simulator to the first group", 0.0)
     with naming_lost_frames((*reference, *changed)):
-        compared = compared_groups(reference, changed, nominal, settings)
-    screened = _screen(compared, candidates, settings, progress, stop)
-    changes, tested, is_complete = _select(compared, screened, settings.comparison, progress, stop)
+        compared = compared_groups(reference, changed, nominal)
+    screened = _screen(compared, candidates, progress, stop)
+    changes, tested, is_complete = _select(compared, screened, progress, stop)
     verdict: ComparisonVerdict = "changed" if changes else "nothing" if is_complete else "inconclusive"
     seconds = MonotonicClock().now_s() - began_s
     sentence = verdict_sentence(verdict, changes, is_complete=is_complete)
@@ -90,24 +88,20 @@ def compare(
 def _screen(
     compared: ComparedGroups,
     only: Sequence[str] | None,
-    settings: DiagnosisSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
 ) -> list[Secants]:
     """Secants of all candidates in both groups."""
     first = compared.fitters[0]
-    few = Fitter(first.windows.thinned(settings.comparison.max_point_windows), first.scale, first.settings)
+    few = Fitter(first.windows.thinned(COMPARISON.max_point_windows), first.scale)
     candidates = change_candidates(compared.config, only)
     found = []
     for k, candidate in enumerate(candidates):
         if stop():
             break
         progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
-        at = candidate_points(few, compared.config, candidate, settings)
-        secants = [
-            at.secants(fitter, errors, settings.comparison.max_secant)
-            for fitter, errors in zip(compared.fitters, compared.errors, strict=True)
-        ]
+        at = candidate_points(few, compared.config, candidate)
+        secants = [at.secants(fitter, errors) for fitter, errors in zip(compared.fitters, compared.errors, strict=True)]
         found.append(Secants(at, compared.decorrelated(secants)))
     return found
 
@@ -115,7 +109,6 @@ def _screen(
 def _select(
     compared: ComparedGroups,
     screened: Sequence[Secants],
-    settings: ComparisonSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
 ) -> tuple[tuple[Change, ...], tuple[Tested, ...], bool]:
@@ -125,10 +118,10 @@ def _select(
         GroupErrors(errors, w.block, part)
         for errors, w, part in zip(compared.decorrelated(compared.errors), windows, compared.parts, strict=True)
     )
-    length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows, settings)
+    length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows)
     model = compared.model
     progress("comparing parts of the first group", 0.7)
-    null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings, stop)
+    null = null_p_values(screened, first, int(second.part.max()) + 1, model, stop)
 
     def adjusted(p: float) -> float:
         return 1.0 if len(null) and p >= null[0] else min(1.0, len(screened) * p)
@@ -137,56 +130,53 @@ def _select(
     ties: list[tuple[str, ...]] = []
     tested: tuple[Tested, ...] = ()
     is_complete = True
-    while len(found) < settings.max_changes and not stop():
+    while len(found) < COMPARISON.max_changes and not stop():
         progress(f"change {len(found) + 1}", 0.75 + 0.08 * len(found))
         groups = (first, replace(second, errors=found[-1].fit.errors) if found else second)
         known = list(found[-1].fit.jacobian) if found else []
         taken = {f.linear.secants.at.candidate.id for f in found}
         others = [s for s in screened if s.at.candidate.id not in taken]
-        linear = linear_changes(others, groups, model, settings, length_ratio=length_ratio, known=known)
+        linear = linear_changes(others, groups, model, length_ratio=length_ratio, known=known)
         tested = tested or tuple(x.tested() for x in linear)
-        if not any(adjusted(x.p_value) < settings.p_max for x in linear):
+        if not any(adjusted(x.p_value) < COMPARISON.p_max for x in linear):
             break
-        refined = [_refine(x, found, compared, settings) for x in linear[: settings.max_refined]]
-        significant = [r for r in refined if adjusted(max(r.p_value, r.linear.p_value)) < settings.p_max]
+        refined = [_refine(x, found, compared) for x in linear[: COMPARISON.max_refined]]
+        significant = [r for r in refined if adjusted(max(r.p_value, r.linear.p_value)) < COMPARISON.p_max]
         best = max(significant, key=lambda r: r.likelihood_ratio, default=None)
-        if best is None or (found and best.likelihood_ratio < settings.min_share_of_first * found[0].likelihood_ratio):
+        if best is None or (
+            found and best.likelihood_ratio < COMPARISON.min_share_of_first * found[0].likelihood_ratio
+        ):
             break
-        ties.append(_ties(best, refined, compared, settings.tie_z))
+        ties.append(_ties(best, refined, compared))
         found.append(best)
     else:
-        is_complete = len(found) == settings.max_changes
+        is_complete = len(found) == COMPARISON.max_changes
     changes = [
-        _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value), settings.model_error_share)
+        _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value))
         for one, near in zip(found, ties, strict=True)
     ]
     return tuple(changes), tested, is_complete
 
 
-def _refine(
-    linear: LinearChange,
-    found: Sequence[_Refined],
-    compared: ComparedGroups,
-    settings: ComparisonSettings,
-) -> _Refined:
+def _refine(linear: LinearChange, found: Sequence[_Refined], compared: ComparedGroups) -> _Refined:
     """Fit a candidate to the second group, together with the changes found before."""
     at = linear.secants.at
     before = found[-1] if found else None
     config = with_candidate(before.fit.fitted if before else compared.config, at.candidate)
     free = (*(before.fit.free if before else ()), *at.candidate.free)
     known = before.fit.z if before else np.zeros(0)
-    step = min(linear.difference.step, settings.max_start_step)
+    step = min(linear.difference.step, COMPARISON.max_start_step)
     point = at.points[linear.point]
     starts = np.array([np.concatenate([known, z]) for z in (at.z0, at.z0 + step * (point - at.z0), point)])
     offset = linear.difference.common * linear.secants.of_group[1][linear.point]
     offset = offset + (before.offset if before else 0.0)
-    fit = fit_change(compared.fitters[1], config, free, starts, compared.model, offset, settings)
+    fit = fit_change(compared.fitters[1], config, free, starts, compared.model, offset)
     ratio = 2.0 * fit.gain / linear.difference.variance_ratio
     p = p_value(linear.difference, ratio, len(at.z0))
     return _Refined(linear, fit, ratio, p, offset)
 
 
-def _ties(best: _Refined, refined: Sequence[_Refined], compared: ComparedGroups, tie_z: float) -> tuple[str, ...]:
+def _ties(best: _Refined, refined: Sequence[_Refined], compared: ComparedGroups) -> tuple[str, ...]:
     """Candidates whose loss on the second group is not significantly larger, the closest first, at most two.
 
     The comparison is that of non-nested models (Vuong 1989), with a standard error clustered by block and multiplied by
@@ -199,7 +189,7 @@ def _ties(best: _Refined, refined: Sequence[_Refined], compared: ComparedGroups,
         if other is best:
             continue
         difference, error = clustered_gain(model.loss(other.fit.errors), loss, windows)
-        if difference < tie_z * error * math.sqrt(best.linear.difference.spread.ratio):
+        if difference < COMPARISON.tie_z * error * math.sqrt(best.linear.difference.spread.ratio):
             near.append((difference, other.linear.secants.at.candidate.id))
     return tuple(name for _, name in sorted(near)[:2])
 
@@ -216,12 +206,11 @@ def _change(
     joint: tuple[FloatArray, list[int], ChangeFit],
     ties: tuple[str, ...],
     p: float,
-    model_error_share: float,
 ) -> Change:
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
     variance = np.diag(last.naive_covariance)[index] * found.design_effect * found.variance_ratio
-    std = np.sqrt(variance + (model_error_share * (z - at.z0)) ** 2)
+    std = np.sqrt(variance + (COMPARISON.model_error_share * (z - at.z0)) ** 2)
     quantile = float(stats.t.ppf(0.95, max(min(found.dof - (len(index) - 1), found.spread.dof), 1.0)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}

@@ -17,7 +17,7 @@ from scipy import stats
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.drive_spread import DriveSpread, spread_of_parts
 from carlab.diagnosis.identification.error_model import ErrorModel
-from carlab.diagnosis.settings import ComparisonSettings
+from carlab.diagnosis.settings import COMPARISON
 from carlab.prediction.windows import IndexArray
 
 MIN_INFORMATION = 1.0
@@ -75,7 +75,6 @@ def difference(
     secants: Sequence[FloatArray],
     groups: Sequence[GroupErrors],
     model: ErrorModel,
-    settings: ComparisonSettings,
     known: Sequence[FloatArray] = (),
 ) -> Difference | None:
     """Difference along a secant; None if a group has too little information about it.
@@ -84,14 +83,13 @@ def difference(
         secants: decorrelated change of the errors of each group (S, D).
         groups: errors of the reference model in both groups.
         model: distribution of the errors.
-        settings: settings of the comparison.
         known: decorrelated Jacobians (S, D) of changes of the second group that are already known; projected out.
     """
     own = [secants[0], _without(secants[1], known, model.weights(groups[1].errors))]
     steps, informations, residuals = [], [], []
     for secant, group in zip(own, groups, strict=True):
         step = 0.0
-        for _ in range(settings.weight_iterations):
+        for _ in range(COMPARISON.weight_iterations):
             weight = model.weights(group.errors + step * secant)
             information = weight * (secant**2).sum(axis=1)
             if information.sum() < MIN_INFORMATION:
@@ -106,14 +104,14 @@ def difference(
     ratio = change**2 * first * second / (first + second)
     of_block = [_of_blocks(i, group) for i, group in zip(informations, groups, strict=True)]
     numbers = [_effective_number(own) for own in of_block]
-    if min(numbers) < settings.min_effective_blocks:
+    if min(numbers) < COMPARISON.min_effective_blocks:
         return None
     effects = [_block_effect(i, score, group) for i, score, group in zip(informations, residuals, groups, strict=True)]
     variances = [effect / information for effect, information in zip(effects, (first, second), strict=True)]
     by_block = sum(variances) / (1.0 / first + 1.0 / second)
     dof = sum(variances) ** 2 / sum(v**2 / (number - 1.0) for v, number in zip(variances, numbers, strict=True))
     spread = spread_of_parts(
-        informations, residuals, [group.part for group in groups], effects, settings.min_part_share
+        informations, residuals, [group.part for group in groups], effects, COMPARISON.min_part_share
     )
     return None if spread is None else Difference(change, steps[0], ratio, (first, second), by_block, spread, dof)
 

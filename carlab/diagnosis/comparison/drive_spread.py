@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.settings import ComparisonSettings
+from carlab.diagnosis.settings import COMPARISON
 from carlab.prediction.windows import IndexArray, PredictionWindows
 
 MAX_PRIOR_DOF = 1e4
@@ -41,19 +41,19 @@ class SpreadPrior:
     ratio: float
     dof: float
 
-    def moderated(self, spread: DriveSpread, length_ratio: float, settings: ComparisonSettings) -> DriveSpread:
+    def moderated(self, spread: DriveSpread, length_ratio: float) -> DriveSpread:
         """Reciprocal of the posterior mean precision for drives ``length_ratio`` times as long as parts; at least 1."""
-        prior_dof = min(self.dof, settings.max_prior_ratio * spread.dof)
+        prior_dof = min(self.dof, COMPARISON.max_prior_ratio * spread.dof)
         dof = prior_dof + spread.dof
         ratio = (prior_dof * self.ratio + spread.dof * spread.ratio) / dof
         return DriveSpread(1.0 + max(ratio - 1.0, 0.0) * max(length_ratio, 1.0), dof)
 
 
-def part_blocks(groups: Sequence[PredictionWindows], settings: ComparisonSettings) -> int:
+def part_blocks(groups: Sequence[PredictionWindows]) -> int:
     """Length of a part in blocks: the longest drive of the second group, or less if the first group is short."""
     first, second = groups
-    most = len(np.unique(first.block)) // settings.min_parts
-    return max(min(longest_drive_blocks(second), most), settings.min_part_blocks)
+    most = len(np.unique(first.block)) // COMPARISON.min_parts
+    return max(min(longest_drive_blocks(second), most), COMPARISON.min_part_blocks)
 
 
 def longest_drive_blocks(windows: PredictionWindows) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,16 +15,15 @@ from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, stated_effects
-from carlab.diagnosis.identification.held_out_errors import noise_floor
+from carlab.diagnosis.identification.held_out_errors import mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
-from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
+from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, check_excitation
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.refit import fit_with_scale
-from carlab.diagnosis.settings import DiagnosisSettings
+from carlab.diagnosis.settings import COMPARISON, DEFAULT
 from carlab.diagnosis.state_alignment import with_known_latency
-from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.windows import IndexArray, PredictionWindows, RecordingSegment, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import confusable_effects
@@ -68,7 +67,6 @@ def compared_groups(
     reference: Sequence[EpisodeData],
     changed: Sequence[EpisodeData],
     nominal: SimulatorConfig,
-    settings: DiagnosisSettings,
 ) -> ComparedGroups:
     """Repair both groups alike, cut them into windows, and fit the base parameters and effects to the first.
 
@@ -77,35 +75,29 @@ def compared_groups(
     """
     nominal = with_known_latency(nominal, (*reference, *changed))
     reference, changed, faults = data_faults_of.check(reference, changed, nominal, alike=True)
-    segments = [_checked_segments(group, k, settings) for k, group in enumerate((reference, changed))]
+    segments = [_checked_segments(group, k) for k, group in enumerate((reference, changed))]
     periods = [t[0].period_s for t in segments]
-    if max(periods) > settings.comparison.period_ratio_max * min(periods):
+    if max(periods) > COMPARISON.period_ratio_max * min(periods):
         raise DataError(
             f"The groups have periods of {periods[0]:.3f} s and {periods[1]:.3f} s; compare recordings of one car."
         )
-    first, second = (_windows(segments_of(group, periods[0]), settings) for group in (reference, changed))
-    variance_s2 = velocity_window_variance_s2(first, nominal, settings.identification)
-    first, second = (
-        without_curvature_bias(replace(w, velocity_window_s2=variance_s2), nominal) for w in (first, second)
-    )
-    noise = estimate_noise(segments[0], first.curvature_bias, settings=settings.identification)
-    per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
-    floor = np.sqrt(np.mean(per_step**2, axis=0))
-    problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), (), settings)
-    base = base_parameters(nominal, settings.identification)
+    first, second = (_windows(segments_of(group, periods[0])) for group in (reference, changed))
+    first, second = with_initial_states((first, second), nominal)
+    noise = estimate_noise(segments[0], first.curvature_bias)
+    floor = mean_noise_floor(first, noise, nominal)
+    problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), ())
+    base = base_parameters(nominal)
     free = (*base, *(f for name in stated_effects(nominal) for f in effect_parameters(name, nominal)))
     fitted = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
-    limits = settings.comparison.max_windows
     one, two = (
-        Fitter(w.thinned(limit), fitted.scale, settings.identification)
-        for w, limit in zip((first, second), limits, strict=True)
+        Fitter(w.thinned(limit), fitted.scale) for w, limit in zip((first, second), COMPARISON.max_windows, strict=True)
     )
     config = fitted.fit.config
     errors = (_errors(one, config), _errors(two, config))
-    length = part_blocks((one.windows, two.windows), settings.comparison)
+    length = part_blocks((one.windows, two.windows))
     parts = (parts_of(one.windows, length), parts_of(two.windows, length))
-    fold = parts[0] % min(settings.comparison.error_folds, int(parts[0].max()) + 1)
-    models = CrossFittedErrors.of(errors[0], fold, settings.comparison)
+    fold = parts[0] % min(COMPARISON.error_folds, int(parts[0].max()) + 1)
+    models = CrossFittedErrors.of(errors[0], fold)
     return ComparedGroups(config, (one, two), errors, parts, models, tuple(faults))
 
 
@@ -114,24 +106,22 @@ def _errors(fitter: Fitter, config: SimulatorConfig) -> FloatArray:
     return np.asarray(white.reshape(len(white), -1))
 
 
-def _checked_segments(episodes: Sequence[EpisodeData], k: int, settings: DiagnosisSettings) -> list[RecordingSegment]:
+def _checked_segments(episodes: Sequence[EpisodeData], k: int) -> list[RecordingSegment]:
     """Segments of a group. Raises Inconclusive if it is too short or too uniform."""
     which = ("first", "second")[k]
     segments = segments_of(episodes)
     seconds = sum(segment.duration_s for segment in segments)
-    needed_s = settings.comparison.block_s * settings.comparison.min_blocks
+    needed_s = COMPARISON.block_s * COMPARISON.min_blocks
     if seconds < needed_s:
         raise Inconclusive(
             f"The {which} group has {seconds:.0f} s of driving; a comparison needs {needed_s:.0f} s in each group."
         )
-    check_excitation(segments, settings.windows)
+    check_excitation(segments, DEFAULT.windows)
     return segments
 
 
-def _windows(segments: Sequence[RecordingSegment], settings: DiagnosisSettings) -> PredictionWindows:
-    cut = cut_windows(
-        segments, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s
-    )
-    if len(np.unique(cut.block)) < settings.comparison.min_blocks:
+def _windows(segments: Sequence[RecordingSegment]) -> PredictionWindows:
+    cut = cut_windows(segments, DEFAULT.windows.fit_window_s, DEFAULT.windows.fit_stride_s, COMPARISON.block_s)
+    if len(np.unique(cut.block)) < COMPARISON.min_blocks:
         raise Inconclusive("The car moves too little in one group; record at least one minute of driving.")
-    return cut.thinned(settings.windows.max_fit_windows)
+    return cut.thinned(DEFAULT.windows.max_fit_windows)

@@ -18,7 +18,7 @@ from carlab.diagnosis.comparison.difference import Difference, GroupErrors, diff
 from carlab.diagnosis.comparison.drive_spread import spread_prior
 from carlab.diagnosis.comparison.result import Tested
 from carlab.diagnosis.identification.error_model import ErrorModel
-from carlab.diagnosis.settings import ComparisonSettings
+from carlab.diagnosis.settings import COMPARISON
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,6 @@ class Secants:
         self,
         groups: Sequence[GroupErrors],
         model: ErrorModel,
-        settings: ComparisonSettings,
         known: Sequence[FloatArray],
     ) -> LinearChange | None:
         """The point with the largest likelihood ratio; None without a usable one.
@@ -46,13 +45,12 @@ class Secants:
         Args:
             groups: errors of both groups.
             model: distribution of the errors.
-            settings: settings of the comparison.
             known: decorrelated Jacobians (S, D) of changes of the second group that are already known.
         """
         found = []
         for k in range(len(self.at.points)):
             own = [g[k] for g in self.of_group]
-            one = difference(own, groups, model, settings, known)
+            one = difference(own, groups, model, known)
             if one is not None and one.step > 0.0:
                 found.append(LinearChange(self, k, one))
         return max(found, key=lambda linear: linear.difference.likelihood_ratio, default=None)
@@ -89,7 +87,6 @@ def linear_changes(
     screened: Sequence[Secants],
     groups: Sequence[GroupErrors],
     model: ErrorModel,
-    settings: ComparisonSettings,
     *,
     length_ratio: float = 1.0,
     known: Sequence[FloatArray] = (),
@@ -100,14 +97,13 @@ def linear_changes(
         screened: candidates with their secants.
         groups: errors of both groups.
         model: distribution of the errors.
-        settings: settings of the comparison.
         length_ratio: length of a drive of the second group over that of a part.
         known: decorrelated Jacobians (S, D) of changes of the second group that are already known.
     """
-    found = [linear for s in screened if (linear := s.best(groups, model, settings, known)) is not None]
+    found = [linear for s in screened if (linear := s.best(groups, model, known)) is not None]
     prior = spread_prior([x.difference.spread for x in found])
     log.debug("spread between drives over that of blocks: %.2f (%.1f degrees of freedom)", prior.ratio, prior.dof)
-    spreads = [prior.moderated(x.difference.spread, length_ratio, settings) for x in found]
+    spreads = [prior.moderated(x.difference.spread, length_ratio) for x in found]
     moderated = [
         replace(x, difference=replace(x.difference, spread=spread)) for x, spread in zip(found, spreads, strict=True)
     ]
@@ -119,7 +115,6 @@ def null_p_values(
     first: GroupErrors,
     parts: int,
     model: ErrorModel,
-    settings: ComparisonSettings,
     stop: Callable[[], bool] = lambda: False,
 ) -> FloatArray:
     """Smallest p-values of linear estimates in comparisons within the first group.
@@ -133,19 +128,18 @@ def null_p_values(
         first: errors of the first group.
         parts: number of parts of the second group; at most half of the first group's are drawn.
         model: distribution of the errors.
-        settings: settings of the comparison.
         stop: callback; if it returns true, the comparisons so far are the result.
 
     Returns:
-        (n,) sorted; n is at most ``settings.null_draws``. Comparisons without a usable candidate do not count.
+        (n,) sorted; n is at most ``COMPARISON.null_draws``. Comparisons without a usable candidate do not count.
     """
     smallest = []
-    for draw in _draws(int(first.part.max()) + 1, parts, settings.null_draws):
+    for draw in _draws(int(first.part.max()) + 1, parts, COMPARISON.null_draws):
         if stop():
             break
         is_second = np.isin(first.part, draw)
         groups = [_subset(first, ~is_second), _subset(first, is_second)]
-        found = linear_changes([s.split(is_second) for s in screened], groups, model, settings)
+        found = linear_changes([s.split(is_second) for s in screened], groups, model)
         if found:
             smallest.append(min(x.p_value for x in found))
     return np.sort(smallest)

@@ -11,11 +11,9 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import RejectedCurves
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
+from carlab.diagnosis.identification.fit_parameters import numbers_at
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
-from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
 
 log = logging.getLogger(__name__)
@@ -48,16 +46,16 @@ def fit_curves(
     settings = problem.settings.curves
     few = replace(problem, windows=problem.windows.thinned(settings.max_windows))
     control.progress("fitting measured curves", 0.0)
-    fit = _fit(few, (*effects, *curves), _coordinates(found.best), settings.first_iterations, settings.last_iterations)
+    fit = _fit(few, (*effects, *curves), found.best.coordinates(), settings.first_iterations, settings.last_iterations)
     fit, curves, rejected = _eliminate(few, fit, effects, curves, control)
     if not curves or control.stop():
         return None, rejected
     control.progress("fitting measured curves to all windows", 0.6)
     effects = _effects_with(problem, found, curves)
-    fit = _fit(problem, (*effects, *curves), _coordinates(fit), settings.iterations, settings.last_iterations)
-    scale = _scale(problem, fit.config)
+    fit = _fit(problem, (*effects, *curves), fit.coordinates(), settings.iterations, settings.last_iterations)
+    scale = problem.scale_of(fit.config)
     named = _effects_with(problem, found, ())
-    reference = _fit(problem, named, _coordinates(found.best), settings.first_iterations, settings.last_iterations)
+    reference = _fit(problem, named, found.best.coordinates(), settings.first_iterations, settings.last_iterations)
     losses = [_left_out_loss(problem, each, scale) for each in (reference, fit)]
     gain, error = clustered_gain(losses[0], losses[1], problem.windows)
     log.info("measured curves %s: gain on left-out blocks %.1f standard errors", ", ".join(curves), gain / error)
@@ -85,8 +83,7 @@ def _fit(problem: SearchProblem, effects: tuple[str, ...], start: dict[str, floa
     config = problem.config_with(effects)
     fit = None
     for count in iterations:
-        values = {f.name: float(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
-        scale = _scale(problem, config.with_values(values))
+        scale = problem.scale_of(config.with_values(numbers_at(free, z)))
         fit = problem.fitter(scale).fit(config, free, z, iterations=count, tolerance=problem.settings.curves.tolerance)
         z = fit.z
     assert fit is not None
@@ -102,7 +99,7 @@ def _eliminate(
         The fit with the remaining curves, these curves, and the removed ones.
     """
     settings = problem.settings.curves
-    scale = _scale(problem, fit.config)
+    scale = problem.scale_of(fit.config)
     loss = _left_out_loss(problem, fit, scale)
     rejected: list[RejectedCurves] = []
     for k, name in enumerate(reversed(curves)):
@@ -110,7 +107,7 @@ def _eliminate(
             break
         control.progress(f"measured curves without {EFFECTS[name].class_statement}", 0.3 + 0.06 * k)
         kept = tuple(c for c in curves if c != name)
-        without = _fit(problem, (*effects, *kept), _coordinates(fit), settings.last_iterations)
+        without = _fit(problem, (*effects, *kept), fit.coordinates(), settings.last_iterations)
         loss_without = _left_out_loss(problem, without, scale)
         rise, error = clustered_gain(loss_without, loss, problem.windows)
         log.info("without %s: the loss on left-out blocks rises by %.1f standard errors", name, rise / error)
@@ -124,13 +121,3 @@ def _left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray
     """Loss of each window (S,) by a fit without its block."""
     limit = problem.settings.selection.max_left_out_error
     return problem.fitter(scale).leave_fold_out_loss(fit, problem.folds(), limit)
-
-
-def _scale(problem: SearchProblem, config: SimulatorConfig) -> Scale:
-    windows = problem.windows
-    error: FloatArray = prediction_errors(simulate_windows(windows, config), windows)[0]
-    return Scale.of(error, problem.floor, settings=problem.settings.identification)
-
-
-def _coordinates(fit: Fit) -> dict[str, float]:
-    return {f.name: float(z) for f, z in zip(fit.free, fit.z, strict=True)}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 
-from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.decisions import Condition
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
@@ -49,9 +49,7 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         (Condition("rivals.curve_z_min", gain / error, settings.curve_z_min, above=False),),
         (Condition("rivals.min_curve_share", share, settings.min_curve_share, above=False),),
     )
-    stand = any(all(c.holds for c in conditions) for conditions in alternatives)
-    for name in contained:
-        control.record(Decision("stand", name, alternatives, stand, len(found.effects)))
+    stand = control.effects_stand(contained, alternatives, len(found.effects))
     log.info("curve in place of %s: %.2f of its gain, z %.1f", ", ".join(contained), share, gain / error)
     return None if stand else rival
 

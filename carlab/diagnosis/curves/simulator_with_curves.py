@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.curves.curve_fit import fit_curves
 from carlab.diagnosis.curves.support import without_extrapolation
-from carlab.diagnosis.identification.held_out_errors import noise_floor
+from carlab.diagnosis.identification.held_out_errors import mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.recording_faults import find as data_faults_of
@@ -51,9 +49,9 @@ def simulator_with_curves(
     repaired, _, _ = data_faults_of.check(episodes, (), nominal)
     # The second argument is scored by a diagnosis; the fit does not use it.
     recordings = split_recordings(repaired, repaired, settings.windows.default_held_out_share, nominal, settings)
-    (windows,) = with_initial_states((recordings.fit_windows,), nominal, settings.identification)
-    noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, settings=settings.identification)
-    floor = np.sqrt(np.mean(noise_floor(windows, noise, nominal, settings.identification)[1:] ** 2, axis=0))
+    (windows,) = with_initial_states((recordings.fit_windows,), nominal)
+    noise = estimate_noise(recordings.fit_segments, windows.curvature_bias)
+    floor = mean_noise_floor(windows, noise, nominal)
     problem = SearchProblem(nominal, windows, floor, noise.measured, {}, EFFECTS_WITH_CURVES, settings)
     control = RunControl()
     found = search(problem, control)

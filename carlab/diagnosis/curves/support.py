@@ -12,6 +12,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit
 from carlab.diagnosis.curves.form_fit import identify_form
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
+from carlab.diagnosis.identification.fit_parameters import numbers_at
 from carlab.diagnosis.settings import CurveSettings
 from carlab.prediction.windows import RecordingSegment
 from sim_backends.array_ops import ARRAYS
@@ -109,8 +110,7 @@ def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Force
 
 def _curve(found: CurveFit, curve: MeasuredCurve, z: FloatArray, grid: Sequence[FloatArray]) -> FloatArray:
     """The curve at its knots for coordinates z (n,) of the fit: the base model's and the deviation."""
-    values = found.fit.config.values()
-    values |= {f.name: float(f.value(np.asarray(v))) for f, v in zip(found.fit.free, z, strict=True)}
+    values = found.fit.config.values() | numbers_at(found.fit.free, z)
     own = {p.name: values[f"effects.{curve.id}.{p.name}"] for p in curve.parameters}
     return np.asarray(curve.base_curve(values, *grid) + np.array(curve.table(own)))
 

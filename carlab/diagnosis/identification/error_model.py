@@ -18,7 +18,7 @@ import numpy as np
 from scipy import stats
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.settings import ComparisonSettings
+from carlab.diagnosis.settings import COMPARISON
 from carlab.prediction.windows import IndexArray
 
 SCATTER_ITERATIONS = 20
@@ -32,23 +32,22 @@ class ErrorModel:
     dof: float
 
     @classmethod
-    def of(cls, errors: FloatArray, ridge_share: float, settings: ComparisonSettings) -> Self:
+    def of(cls, errors: FloatArray, ridge_share: float) -> Self:
         """Scatter of errors (S, D) by expectation maximisation (Liu and Rubin 1995), with a ridge.
 
         Args:
             errors: of the model.
             ridge_share: added to the diagonal of the scatter, as a share of it.
-            settings: settings of the comparison.
         """
         count, size = errors.shape
         scatter = errors.T @ errors / count
         for _ in range(SCATTER_ITERATIONS):
             distance_sq = _distance_sq(errors, scatter + 1e-6 * np.eye(size))
-            weighted = errors * ((settings.student_dof + size) / (settings.student_dof + distance_sq))[:, None]
+            weighted = errors * ((COMPARISON.student_dof + size) / (COMPARISON.student_dof + distance_sq))[:, None]
             scatter = weighted.T @ errors / count
-        scatter = scatter + ridge_share * np.diag(np.diag(scatter)) + settings.ridge_variance * np.eye(size)
+        scatter = scatter + ridge_share * np.diag(np.diag(scatter)) + COMPARISON.ridge_variance * np.eye(size)
         scatter = scatter * np.median(_distance_sq(errors, scatter)) / stats.chi2.median(size)
-        return cls(np.asarray(np.linalg.cholesky(np.linalg.inv(scatter))), settings.student_dof)
+        return cls(np.asarray(np.linalg.cholesky(np.linalg.inv(scatter))), COMPARISON.student_dof)
 
     def decorrelated(self, errors: FloatArray) -> FloatArray:
         """Errors (..., D) in standard deviations along independent directions."""
@@ -84,18 +83,17 @@ class CrossFittedErrors:
     fold: IndexArray
 
     @classmethod
-    def of(cls, errors: FloatArray, fold: IndexArray, settings: ComparisonSettings) -> Self:
+    def of(cls, errors: FloatArray, fold: IndexArray) -> Self:
         """Error models with the ridge that has the largest likelihood on the folds that are left out.
 
         Args:
             errors: (S, D) of the reference model on the first group.
             fold: (S,) fold of each window, from 0 on.
-            settings: settings of the comparison.
         """
         folds = range(int(fold.max()) + 1)
 
         def without_each(share: float) -> tuple[ErrorModel, ...]:
-            return tuple(ErrorModel.of(errors[fold != k], share, settings) for k in folds)
+            return tuple(ErrorModel.of(errors[fold != k], share) for k in folds)
 
         def loss_left_out(models: tuple[ErrorModel, ...]) -> float:
             left_out = [errors[fold == k] for k in folds]
@@ -104,9 +102,9 @@ class CrossFittedErrors:
                 for m, e in zip(models, left_out, strict=True)
             )
 
-        tried = [(share, without_each(share)) for share in settings.ridge_shares]
+        tried = [(share, without_each(share)) for share in COMPARISON.ridge_shares]
         share, models = min(tried, key=lambda one: loss_left_out(one[1]))
-        return cls(ErrorModel.of(errors, share, settings), models, fold)
+        return cls(ErrorModel.of(errors, share), models, fold)
 
     def decorrelated(self, errors: FloatArray) -> FloatArray:
         """Errors (..., S, D) of the first group, each by the model without its fold."""

@@ -8,9 +8,11 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
+from carlab.prediction.errors import bounded
 
-_MAX_WHITE = 1e4
+MAX_WHITE = 1e4
+"""Maximum size of a whitened error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,18 +28,13 @@ class Scale:
     root: FloatArray | None = None
 
     @classmethod
-    def of(
-        cls,
-        error: FloatArray,
-        floor: FloatArray,
-        share: float = 1.0,
-        settings: IdentificationSettings = DEFAULT.identification,
-    ) -> Scale:
+    def of(cls, error: FloatArray, floor: FloatArray) -> Scale:
         """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
         last = error.shape[1] - 1
-        steps = np.unique(np.linspace(last / settings.loss_steps, last, settings.loss_steps).round().astype(int))
+        count = IDENTIFICATION.loss_steps
+        steps = np.unique(np.linspace(last / count, last, count).round().astype(int))
         spread = STD_OVER_MAD * np.median(np.abs(error[:, steps]), axis=0)
-        return cls(steps, np.maximum(share * spread, floor))
+        return cls(steps, np.maximum(spread, floor))
 
     def white(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
@@ -45,22 +42,22 @@ class Scale:
 
     def white_at_steps(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., U, 6) at the steps; none is infinite or NaN."""
-        white = bounded(error / self.sigma)
+        white = bounded(error / self.sigma, MAX_WHITE)
         if self.root is None:
             return white
-        return bounded((white.reshape(*white.shape[:-2], -1) @ self.root).reshape(white.shape))
+        return bounded((white.reshape(*white.shape[:-2], -1) @ self.root).reshape(white.shape), MAX_WHITE)
 
     def as_bytes(self) -> tuple[bytes, ...]:
         """The content, to compare scales by."""
         return tuple(b"" if each is None else each.tobytes() for each in (self.steps, self.sigma, self.root))
 
 
-def bounded(white: FloatArray) -> FloatArray:
-    """Whitened errors (...) of which none is infinite or NaN, as those of a diverged simulation are."""
-    return np.fmax(np.fmin(white, _MAX_WHITE), -_MAX_WHITE)  # of NaN and a number, these return the number
-
-
-def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
-    """Huber's loss of whitened errors (...), element by element; it is linear from ``delta`` on."""
-    size = np.abs(white)
+def huber(white: FloatArray) -> FloatArray:
+    """Huber's loss of whitened errors (...), element by element; it is linear from ``huber_delta`` on."""
+    delta, size = IDENTIFICATION.huber_delta, np.abs(white)
     return np.where(size <= delta, 0.5 * white**2, delta * size - 0.5 * delta**2)
+
+
+def huber_weight(white: FloatArray) -> FloatArray:
+    """Weight of each whitened error (...) in least squares with the gradient of Huber's loss."""
+    return np.minimum(1.0, IDENTIFICATION.huber_delta / np.maximum(np.abs(white), 1e-12))

@@ -22,10 +22,10 @@ from carlab.diagnosis.identification.bounded_step import (
     held_at_bounds,
     inward_steps,
 )
-from carlab.diagnosis.identification.error_scale import Scale, huber
-from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
+from carlab.diagnosis.identification.error_scale import Scale, huber, huber_weight
+from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, numbers_at, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import longest_step_s, simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows
@@ -69,7 +69,11 @@ class Fit:
 
     def values(self) -> dict[str, float]:
         """Fitted values by dotted name."""
-        return {f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)}
+        return numbers_at(self.free, self.z)
+
+    def coordinates(self) -> dict[str, float]:
+        """Coordinates by dotted name."""
+        return {f.name: float(z) for f, z in zip(self.free, self.z, strict=True)}
 
 
 class _Point(NamedTuple):
@@ -91,16 +95,9 @@ class Linearisation(NamedTuple):
 class Fitter:
     """Fits parameters of a simulator to windows with a given scale."""
 
-    def __init__(
-        self, windows: PredictionWindows, scale: Scale, settings: IdentificationSettings = DEFAULT.identification
-    ) -> None:
+    def __init__(self, windows: PredictionWindows, scale: Scale) -> None:
         self.windows = windows
         self.scale = scale
-        self.settings = settings
-
-    def huber(self, white: FloatArray) -> FloatArray:
-        """Huber's loss of whitened errors (...), element by element."""
-        return huber(white, self.settings.huber_delta)
 
     def white(
         self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray, max_step_s: float | None = None
@@ -109,8 +106,8 @@ class Fitter:
 
         ``max_step_s`` is the maximum integration step [s]; default: that of ``simulate_windows``.
         """
-        if len(z) > self.settings.max_batch_sets:
-            parts = np.array_split(z, math.ceil(len(z) / self.settings.max_batch_sets))
+        if len(z) > IDENTIFICATION.max_batch_sets:
+            parts = np.array_split(z, math.ceil(len(z) / IDENTIFICATION.max_batch_sets))
             return np.concatenate([self.white(config, free, part, max_step_s) for part in parts])
         return self._white(self.windows, config, {f.name: f.value(z[:, k]) for k, f in enumerate(free)}, max_step_s)
 
@@ -143,7 +140,7 @@ class Fitter:
             changed = self.white(config, free, moved, max_step_s)
             jacobian[everywhere] = (changed - white) / steps[everywhere, None, None, None]
         knots = np.flatnonzero(~everywhere)
-        batches = math.ceil(influences[knots].sum() / (max(len(self.windows), 1) * self.settings.max_batch_sets))
+        batches = math.ceil(influences[knots].sum() / (max(len(self.windows), 1) * IDENTIFICATION.max_batch_sets))
         for batch in np.array_split(knots, batches) if batches else ():
             row, window = np.nonzero(influences[batch])
             of_windows = dict(values)
@@ -160,8 +157,8 @@ class Fitter:
         for curve in CURVES:
             own = [index[n] for p in curve.parameters if (n := f"effects.{curve.id}.{p.name}") in index]
             if own:
-                rows = curve.roughness() / self.settings.curve_roughness_std
-                precision[np.ix_(own, own)] += rows.T @ rows + np.eye(len(own)) / self.settings.curve_std**2
+                rows = curve.roughness() / IDENTIFICATION.curve_roughness_std
+                precision[np.ix_(own, own)] += rows.T @ rows + np.eye(len(own)) / IDENTIFICATION.curve_std**2
         return precision
 
     def prior(self, free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
@@ -178,12 +175,12 @@ class Fitter:
     ) -> FloatArray:
         """Huber loss of each window (S,), with whitened errors clipped at ``max_error``."""
         at = np.zeros((1, len(free))) if z is None else z[None]
-        return np.asarray(self.huber(self.white(config, free, at).clip(-max_error, max_error))[0].sum(axis=(1, 2)))
+        return np.asarray(huber(self.white(config, free, at).clip(-max_error, max_error))[0].sum(axis=(1, 2)))
 
     def best_point(self, config: SimulatorConfig, free: Sequence[FitParameter], starts: FloatArray) -> FloatArray:
         """The point (n,) of (P, n) with the smallest cost."""
         costs = [
-            self.huber(self.white(config, free, part)).sum(axis=(1, 2, 3)) + self.prior(free, part)
+            huber(self.white(config, free, part)).sum(axis=(1, 2, 3)) + self.prior(free, part)
             for part in np.array_split(starts, max(1, math.ceil(len(starts) / 8)))
         ]
         return np.asarray(starts[int(np.argmin(np.concatenate(costs)))])
@@ -209,7 +206,7 @@ class Fitter:
             iterations: maximum number.
             tolerance: the fit ends when an iteration without strong damping lowers the cost by less than this share.
             compared_cost: cost of a model that the fit is only compared with. Then a fall by less than
-                ``compared_tolerance`` (of the settings) of the difference ends the fit too.
+                ``compared_tolerance`` of the difference ends the fit too.
         """
         count = len(free)
         z = np.zeros(count) if start is None else np.array(start, dtype=np.float64)
@@ -221,7 +218,7 @@ class Fitter:
         z = z.clip(low, high)
         precision = self.precision(free)
         white = self.white(config, free, z[None])[0]
-        at = _Point(z, white, float(self.huber(white).sum() + self.prior(free, z[None])[0]), 1e-2)
+        at = _Point(z, white, float(huber(white).sum() + self.prior(free, z[None])[0]), 1e-2)
         for _ in range(iterations):
             before = at.cost
             normal, gradient = self._normal(self.jacobian(config, free, at.z, at.white), at.white)
@@ -231,11 +228,11 @@ class Fitter:
                 break
             at = lower
             difference = 0.0 if compared_cost is None else abs(at.cost - compared_cost)
-            smallest = max(tolerance * at.cost, self.settings.compared_tolerance * difference)
+            smallest = max(tolerance * at.cost, IDENTIFICATION.compared_tolerance * difference)
             if before - at.cost < smallest and at.damping <= MAX_DAMPING_AT_END:
                 break
-        fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, at.z, strict=True)})
-        return Fit(fitted, free, at.z, at.cost, np.asarray(self.huber(at.white).sum(axis=(1, 2))))
+        fitted = config.with_values(numbers_at(free, at.z))
+        return Fit(fitted, free, at.z, at.cost, np.asarray(huber(at.white).sum(axis=(1, 2))))
 
     def _lower_point(
         self,
@@ -262,7 +259,7 @@ class Fitter:
             matrices = [normal + value * np.diag(np.diag(normal) + 1e-9) for value in dampings]
             tried = at.z + np.array([bounded_step(matrix, gradient, lowest, highest) for matrix in matrices])
             whites = self.white(config, free, tried)
-            costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
+            costs = huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
             best = int(np.argmin(costs))
             if costs[best] < at.cost:
                 return _Point(tried[best], whites[best], float(costs[best]), max(float(dampings[best]), 1e-6))
@@ -326,7 +323,7 @@ class Fitter:
             return self.loss(fit.config, max_error=max_error)
         loss = np.zeros(len(self.windows))
         for own, _, white in self._without_each_fold(fit, folds, linearisation or self.linearised(fit)):
-            loss[own] = self.huber(white.clip(-max_error, max_error)).sum(axis=(1, 2))
+            loss[own] = huber(white.clip(-max_error, max_error)).sum(axis=(1, 2))
         return loss
 
     def leave_fold_out_coordinates(
@@ -348,7 +345,7 @@ class Fitter:
         the cost of a few predictions; a refit costs a hundred.
         """
         jacobian, white = linearisation
-        weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
+        weight = huber_weight(white)
         information, score = self._information(jacobian, white)
         normal = information + self.precision(fit.free)
         low, high = coordinate_bounds(fit.free)
@@ -358,10 +355,10 @@ class Fitter:
             reduced = normal - (part * weight[own].reshape(-1)) @ part.T
             reduced = reduced + 1e-3 * np.diag(np.diag(normal) + 1e-9)
             step = bounded_step(reduced, -score[:, own].sum(axis=1), low - fit.z, high - fit.z)
-            step *= min(1.0, self.settings.max_fold_step / max(float(np.abs(step).max()), 1e-12))
-            trials = fit.z + np.array(self.settings.fold_step_shares)[:, None] * step
+            step *= min(1.0, IDENTIFICATION.max_fold_step / max(float(np.abs(step).max()), 1e-12))
+            trials = fit.z + np.array(IDENTIFICATION.fold_step_shares)[:, None] * step
             whites = self.white(fit.config, fit.free, trials)
-            other_costs = self.huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
+            other_costs = huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
             best = int(np.argmin(other_costs))
             yield own, trials[best], whites[best, own]
 
@@ -373,11 +370,11 @@ class Fitter:
     def _normal(self, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix (n, n) and gradient (n,) of the loss without the prior."""
         flat, residual = jacobian.reshape(len(jacobian), white.size), white.reshape(-1)
-        weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(residual), 1e-12))
+        weight = huber_weight(residual)
         return (flat * weight) @ flat.T, flat @ (weight * residual)
 
     def _information(self, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix (n, n) without the prior, and each window's score (n, S)."""
-        weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
+        weight = huber_weight(white)
         flat = jacobian.reshape(len(jacobian), -1)
         return (flat * weight.reshape(-1)) @ flat.T, (jacobian * (weight * white)[None]).sum(axis=(2, 3))

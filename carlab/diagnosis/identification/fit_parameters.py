@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS
 from sim_backends.measurement import LATENCY
@@ -86,7 +86,6 @@ class FitParameter:
 
 def base_parameters(
     config: SimulatorConfig,
-    settings: IdentificationSettings = DEFAULT.identification,
     *,
     uses_std: bool = False,
 ) -> tuple[FitParameter, ...]:
@@ -94,7 +93,6 @@ def base_parameters(
 
     Args:
         config: the simulator.
-        settings: widths of the priors.
         uses_std: whether a standard deviation in the car file, as a diagnosis writes it, is the width of the prior,
             together with the usual change of a car (``prior_change_share``).
     """
@@ -107,12 +105,12 @@ def base_parameters(
     for name in names:
         info, value = REGISTRY[name], values[name]
         low, high = max(info.low, 0.05 * value), min(info.high, 20.0 * value)
-        share = settings.prior_std_share
+        share = IDENTIFICATION.prior_std_share
         if name in config.priors:
             low, high = config.priors[name]
             share = max((high - low) / (4.0 * abs(value)), 1e-3)
         if uses_std and name in config.parameter_std and value > 0:
-            share = min(share, math.hypot(config.parameter_std[name] / value, settings.prior_change_share))
+            share = min(share, math.hypot(config.parameter_std[name] / value, IDENTIFICATION.prior_change_share))
         if value > 0:
             found.append(FitParameter(name, value, 0.1, low, high, True, share / 0.1))
         else:
@@ -120,7 +118,7 @@ def base_parameters(
     if LATENCY in config.unknown:
         found.append(
             FitParameter(
-                LATENCY, values[LATENCY], settings.latency_std_s, 0.0, settings.max_latency_s, prior_z=1.0,
+                LATENCY, values[LATENCY], IDENTIFICATION.latency_std_s, 0.0, IDENTIFICATION.max_latency_s, prior_z=1.0,
                 is_delay=True,
             )
         )  # fmt: skip
@@ -180,6 +178,11 @@ def stated_values(config: SimulatorConfig, effect_id: str) -> dict[str, float]:
 def difference_steps(free: Sequence[FitParameter]) -> FloatArray:
     """Steps (n,) of the coordinates for finite differences."""
     return np.array([f.difference_step for f in free])
+
+
+def numbers_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, float]:
+    """Values by dotted name at coordinates z (n,)."""
+    return {f.name: float(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
 def values_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArray]:

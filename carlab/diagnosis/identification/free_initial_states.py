@@ -15,10 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.error_scale import bounded, huber
+from carlab.diagnosis.identification.error_scale import MAX_WHITE, huber, huber_weight
 from carlab.diagnosis.identification.fit_parameters import FitParameter
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
@@ -35,7 +34,6 @@ def loss_of_free_initial_states(
     measured_std: FloatArray,
     *,
     max_error: float,
-    settings: IdentificationSettings = DEFAULT.identification,
 ) -> FloatArray:
     """Huber loss (S,) of each window at the initial state that minimises it.
 
@@ -46,35 +44,30 @@ def loss_of_free_initial_states(
         z: their coordinates for each window (S, n).
         measured_std: standard deviations (6,) of the measured channels.
         max_error: bound of the whitened errors in the loss.
-        settings: settings of the fit.
     """
     white, jacobian = linearised_by_initial_states(windows, config, free, z, measured_std)
-    _, error, _ = initial_state_correction(white, jacobian, settings.huber_delta)
-    return np.asarray(huber(error.clip(-max_error, max_error), settings.huber_delta).sum(axis=1))
+    _, error, _ = initial_state_correction(white, jacobian)
+    return np.asarray(huber(error.clip(-max_error, max_error)).sum(axis=1))
 
 
-def initial_state_correction(
-    white: FloatArray, jacobian: FloatArray, huber_delta: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def initial_state_correction(white: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Initial states that minimise the Huber loss of each window, by reweighted least squares.
 
     Args:
         white: whitened errors (S, E).
         jacobian: their derivatives (S, E, 6) by the initial states.
-        huber_delta: error from which the loss is linear.
 
     Returns:
         Change of the initial states (S, 6), the errors (S, E) with it, and the weights (S, E) of these errors.
     """
     shift = np.zeros((len(white), 6))
     for _ in range(_REWEIGHTINGS):
-        error = np.abs(white + np.einsum("sek,sk->se", jacobian, shift))
-        weight = np.minimum(1.0, huber_delta / np.maximum(error, 1e-12))
+        weight = huber_weight(white + np.einsum("sek,sk->se", jacobian, shift))
         weighted = jacobian * weight[..., None]
         normal = np.swapaxes(weighted, 1, 2) @ jacobian + 1e-9 * np.eye(6)
         shift = -np.linalg.solve(normal, np.einsum("sek,se->sk", weighted, white)[..., None])[..., 0]
     error = white + np.einsum("sek,sk->se", jacobian, shift)
-    return shift, error, np.minimum(1.0, huber_delta / np.maximum(np.abs(error), 1e-12))
+    return shift, error, huber_weight(error)
 
 
 def linearised_by_initial_states(
@@ -94,5 +87,5 @@ def linearised_by_initial_states(
             replace(stacked, initial_states=moved.reshape(-1, 6)), config, values, in_double=True
         )
         error = prediction_errors(predicted.reshape(7, count, -1, 6), windows)[:, :, 1:]
-        white = bounded(error / measured_std).reshape(7, count, -1)
+        white = bounded(error / measured_std, MAX_WHITE).reshape(7, count, -1)
     return white[0], np.moveaxis(white[1:] - white[0], 0, -1)

@@ -14,7 +14,7 @@ from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.identification.error_scale import huber
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.identification.measurement_noise import Noise
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import final_errors, prediction_errors
 from carlab.prediction.predict import PredictiveModel, SimulatorModel, simulate_windows
 from carlab.prediction.windows import PredictionWindows
@@ -30,13 +30,11 @@ class HeldOut:
         floor: (6,) error of a perfect simulator after the horizon, estimated from the recording: measurement noise at
             the end, and the propagated error of the initial state; x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
         noise: noise of the recordings that were fitted.
-        huber_delta: error, over its robust standard deviation, from which Huber's loss is linear.
     """
 
     windows: PredictionWindows
     floor: FloatArray
     noise: Noise
-    huber_delta: float = DEFAULT.identification.huber_delta
 
     @classmethod
     def of(
@@ -44,10 +42,9 @@ class HeldOut:
         windows: PredictionWindows,
         noise: Noise,
         config: SimulatorConfig,
-        settings: IdentificationSettings = DEFAULT.identification,
     ) -> HeldOut:
         """Compute the noise floor; the car file's simulator ``config`` propagates the errors of initial states."""
-        return cls(windows, noise_floor(windows, noise, config, settings)[-1], noise, settings.huber_delta)
+        return cls(windows, noise_floor(windows, noise, config)[-1], noise)
 
     @property
     def recording_noise(self) -> RecordingNoise:
@@ -87,7 +84,7 @@ class HeldOut:
     def gain(self, without: FloatArray, with_it: FloatArray) -> tuple[float, float]:
         """Held-out gain in Huber log-likelihood from errors (S, 6) to errors (S, 6), and its clustered error."""
         scale = np.maximum(STD_OVER_MAD * np.median(np.abs(with_it), axis=0), self.floor)
-        before, after = (huber(e / scale, self.huber_delta).sum(axis=1) for e in (without, with_it))
+        before, after = (huber(e / scale).sum(axis=1) for e in (without, with_it))
         return clustered_gain(before, after, self.windows)
 
     @staticmethod
@@ -101,7 +98,6 @@ def noise_floor(
     windows: PredictionWindows,
     noise: Noise,
     config: SimulatorConfig,
-    settings: IdentificationSettings = DEFAULT.identification,
 ) -> FloatArray:
     """Error (K + 1, 6) that noise alone causes along a window: measurement noise and propagated initial error."""
     reference = simulate_windows(windows, config)
@@ -112,5 +108,11 @@ def noise_floor(
         moved = simulate_windows(replace(windows, initial_states=initial_states), config)
         grown = prediction_errors(moved - reference + windows.measured[None], windows)[0]
         squared = grown**2
-        variance += np.mean(np.minimum(squared, np.quantile(squared, settings.max_error_quantile, axis=0)), axis=0)
+        largest = np.quantile(squared, IDENTIFICATION.max_error_quantile, axis=0)
+        variance += np.mean(np.minimum(squared, largest), axis=0)
     return np.sqrt(variance)
+
+
+def mean_noise_floor(windows: PredictionWindows, noise: Noise, config: SimulatorConfig) -> FloatArray:
+    """Root mean square (6,) of the noise floor over the steps of a window, without the initial state."""
+    return np.asarray(np.sqrt(np.mean(noise_floor(windows, noise, config)[1:] ** 2, axis=0)))

@@ -26,14 +26,15 @@ from carlab.diagnosis.identification.bounded_step import (
     held_at_bounds,
     inward_steps,
 )
-from carlab.diagnosis.identification.error_scale import bounded, huber
+from carlab.diagnosis.identification.error_scale import MAX_WHITE, huber
 from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter
-from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
+from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, numbers_at
 from carlab.diagnosis.identification.free_initial_states import (
     initial_state_correction,
     linearised_by_initial_states,
 )
-from carlab.prediction.errors import prediction_errors
+from carlab.diagnosis.settings import IDENTIFICATION
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import IndexArray
 from sim_backends.car_parameters import SimulatorConfig
@@ -85,14 +86,14 @@ def joint_fit(fitter: Fitter, start: Fit, measured_std: FloatArray) -> Fit | Non
 
     Returns:
         The simulator with the covariance of its parameters; cost and loss are those with estimated initial states. None
-        if the simulator leaves more than noise (``IdentificationSettings.joint_max_noise_ratio``): then free initial
+        if the simulator leaves more than noise (``joint_max_noise_ratio``): then free initial
         states would hide a part of its error. None, too, if the iterations end at a higher cost than that of ``start``.
     """
     problem = _Problem(fitter, start.config, start.free, measured_std)
     if not start.free:
         return None
     shift, noise_ratio = problem.with_free_initial_states(start.z)
-    if noise_ratio > fitter.settings.joint_max_noise_ratio:
+    if noise_ratio > IDENTIFICATION.joint_max_noise_ratio:
         return None
     precision = fitter.precision(start.free)
     at_start = _trial(problem, start.z, fitter.windows.initial_states, shift, precision)
@@ -158,7 +159,7 @@ def _result(problem: _Problem, point: _Point, precision: FloatArray) -> Fit:
     at = problem.linearised(z, point.states)
     gradient = _normal(at.projected()[0], at)[1] + precision @ z
     covariance = _covariance(at, fitter.windows.block, precision, held_at_bounds(free, z, gradient))
-    config = problem.config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
+    config = problem.config.with_values(numbers_at(free, z))
     loss = fitter.loss(config)
     cost = float(loss.sum() + fitter.prior(free, z[None])[0])
     return Fit(config, free, z, cost, loss, covariance)
@@ -193,12 +194,12 @@ class _Problem:
         windows = self.fitter.windows
         of_windows = np.tile(z, (len(windows), 1))
         white, jacobian = linearised_by_initial_states(windows, self.config, self.free, of_windows, self.std)
-        shift, error, _ = initial_state_correction(white, jacobian, self.fitter.settings.huber_delta)
+        shift, error, _ = initial_state_correction(white, jacobian)
         return shift * self.std, float(np.median(error**2)) / _NORMAL_MEDIAN_SQUARE
 
     def losses(self, white: FloatArray) -> FloatArray:
         """Huber loss of each window (..., S) of whitened errors (..., S, E)."""
-        return np.asarray(huber(white, self.fitter.settings.huber_delta).sum(axis=-1))
+        return np.asarray(huber(white).sum(axis=-1))
 
     def white(self, z: FloatArray, states: FloatArray) -> FloatArray:
         """Whitened errors (P, S, E) with parameters (P, n) and initial states (P, S, 6)."""
@@ -209,7 +210,7 @@ class _Problem:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(stacked, self.config, values, in_double=True).reshape(sets, count, -1, 6)
             white = prediction_errors(predicted, windows)[:, :, 1:] / self.std
-        return bounded(white).reshape(sets, count, -1)
+        return bounded(white, MAX_WHITE).reshape(sets, count, -1)
 
     def linearised(self, z: FloatArray, states: FloatArray) -> _Linearisation:
         """Errors at the best initial states near ``states`` (S, 6), and derivatives."""
@@ -220,5 +221,5 @@ class _Problem:
         white = self.white(moved_z, moved_states)
         changes = np.moveaxis(white[1:] - white[0], 0, -1)
         by_states, by_parameters = changes[..., :6] / _STATE_STEP, changes[..., 6:] / steps
-        shift, error, weights = initial_state_correction(white[0], by_states, self.fitter.settings.huber_delta)
+        shift, error, weights = initial_state_correction(white[0], by_states)
         return _Linearisation(error, by_states, by_parameters, shift * self.std, weights)

@@ -17,7 +17,7 @@ from scipy.signal import freqz, savgol_coeffs, welch
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise, StateStd
 from carlab.core.robust import STD_OVER_MAD
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.windows import MIN_QUINTIC_WIDTH, RecordingSegment, smoothing_width
 
 MIN_SPREAD = 1e-12
@@ -50,7 +50,6 @@ def estimate_noise(
     curvature_bias: FloatArray,
     *,
     slowest: bool = False,
-    settings: IdentificationSettings = DEFAULT.identification,
 ) -> Noise:
     """Estimate the noise of each channel and of initial states.
 
@@ -62,19 +61,16 @@ def estimate_noise(
         segments: the recordings.
         curvature_bias: (S, 6) of prediction windows: initial states by a local quintic minus those by the local cubic.
         slowest: whether to use only the slowest rows for the noise of the channels.
-        settings: settings of the estimate.
     """
     period_s = segments[0].sampled_s
     width = smoothing_width(period_s)
     residual = np.concatenate([t.residual for t in segments])
     if slowest:
         speed = np.concatenate([t.speed for t in segments])
-        residual = residual[speed <= np.quantile(speed, settings.slowest_share)]
-    measured = np.array(
-        [_deviation(residual[:, k], period_s, width, velocity=k > 2, settings=settings) for k in range(6)]
-    )
+        residual = residual[speed <= np.quantile(speed, IDENTIFICATION.slowest_share)]
+    measured = np.array([_deviation(residual[:, k], period_s, width, velocity=k > 2) for k in range(6)])
     measured[:2] = np.sqrt(np.mean(measured[:2] ** 2))
-    measured = np.maximum(measured, settings.min_noise_std)
+    measured = np.maximum(measured, IDENTIFICATION.min_noise_std)
 
     wide = max(width, MIN_QUINTIC_WIDTH)
 
@@ -86,28 +82,26 @@ def estimate_noise(
     cubic_noise = np.concatenate([np.linalg.norm(w) * measured[:3] for w in cubic])
     difference_noise = np.concatenate([np.linalg.norm(w) * measured[:3] for w in cubic - quintic])
     squared = curvature_bias**2
-    clipped = np.minimum(squared, np.quantile(squared, settings.max_error_quantile, axis=0))
+    clipped = np.minimum(squared, np.quantile(squared, IDENTIFICATION.max_error_quantile, axis=0))
     bias = np.mean(clipped, axis=0) - difference_noise**2
     return Noise(measured, np.sqrt(cubic_noise**2 + np.maximum(bias, 0.0)))
 
 
-def _deviation(
-    residual: FloatArray, period_s: float, width: int, *, velocity: bool, settings: IdentificationSettings
-) -> float:
+def _deviation(residual: FloatArray, period_s: float, width: int, *, velocity: bool) -> float:
     """Standard deviation of the noise whose residual (n,) of a local cubic over ``width`` samples is ``residual``."""
     spread = STD_OVER_MAD * float(np.median(np.abs(residual)))
     if spread < MIN_SPREAD:
         return 0.0
-    limit = settings.noise_max_z * spread
+    limit = IDENTIFICATION.noise_max_z * spread
     clipped = np.clip(residual, -limit, limit)
-    segment_rows = max(settings.noise_segment_rows, round(settings.noise_segment_s / period_s))
+    segment_rows = max(IDENTIFICATION.noise_segment_rows, round(IDENTIFICATION.noise_segment_s / period_s))
     rows = min(segment_rows, len(clipped))
     frequency, power = welch(clipped, 1.0 / period_s, nperseg=rows, detrend=False)
     high_pass = -savgol_coeffs(width, 3)
     high_pass[width // 2] += 1.0
     power_gain = np.abs(freqz(high_pass, worN=2.0 * np.pi * frequency * period_s)[1]) ** 2
-    edge = int(np.argmax(power_gain > settings.min_power_share))
-    noise = power / np.maximum(power_gain, settings.min_power_share)
+    edge = int(np.argmax(power_gain > IDENTIFICATION.min_power_share))
+    noise = power / np.maximum(power_gain, IDENTIFICATION.min_power_share)
     noise[:edge] = np.mean(noise[edge : edge + 3])
     if velocity:
         noise[:edge] *= (frequency[:edge] / frequency[edge]) ** 2

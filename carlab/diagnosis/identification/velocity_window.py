@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows, velocity_curvature
 from carlab.prediction.windows import PredictionWindows, body_states
@@ -25,7 +25,6 @@ from sim_backends.car_parameters import SimulatorConfig
 def with_initial_states(
     windows: Sequence[PredictionWindows],
     config: SimulatorConfig,
-    settings: IdentificationSettings = DEFAULT.identification,
     variance_s2: float | None = None,
 ) -> tuple[PredictionWindows, ...]:
     """Estimate velocity window and initial states of sets of windows.
@@ -33,27 +32,23 @@ def with_initial_states(
     Args:
         windows: windows for the estimate of the velocity window, and further windows of the same recordings.
         config: an approximate simulator.
-        settings: settings of the estimate.
         variance_s2: variance of the velocity window [s2] if it is known.
     """
     if variance_s2 is None:
-        variance_s2 = velocity_window_variance_s2(windows[0], config, settings)
+        variance_s2 = velocity_window_variance_s2(windows[0], config)
     known = [replace(w, velocity_window_s2=variance_s2) for w in windows]
     return tuple(without_curvature_bias(w, config) if len(w) else w for w in known)
 
 
-def velocity_window_variance_s2(
-    windows: PredictionWindows, config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
-) -> float:
+def velocity_window_variance_s2(windows: PredictionWindows, config: SimulatorConfig) -> float:
     """Variance [s2] of the window of the velocity columns; 0 if it is not significant.
 
     Args:
         windows: windows of recordings with the same velocity estimator.
         config: an approximate simulator.
-        settings: settings of the estimate.
     """
     period_s = windows.period_s
-    if period_s > settings.velocity_max_period_s or windows.steps < 6:
+    if period_s > IDENTIFICATION.velocity_max_period_s or windows.steps < 6:
         return 0.0
     boxed = _box_velocities(windows)
     difference = (boxed[:, 1:-1] - windows.measured[:, 2:-2])[..., 3:]
@@ -63,7 +58,7 @@ def velocity_window_variance_s2(
     for channels in ((0, 1), (2,)):
         z, d, b = (values[..., channels].ravel() for values in (instrument, difference, curvature))
         covariance = float(z @ b)
-        if len(z) < settings.velocity_min_samples or abs(covariance) < 1e-9:
+        if len(z) < IDENTIFICATION.velocity_min_samples or abs(covariance) < 1e-9:
             continue
         slope = float(z @ d) / covariance
         error = float(np.linalg.norm(z * (d - slope * b))) / abs(covariance)
@@ -72,8 +67,8 @@ def velocity_window_variance_s2(
     if not variances:
         return 0.0
     mean = float(np.average(variances, weights=precisions))
-    is_significant = mean * float(np.sqrt(np.sum(precisions))) > settings.velocity_z_min
-    return min(mean, settings.velocity_max_width_s**2 / 12.0) if is_significant else 0.0
+    is_significant = mean * float(np.sqrt(np.sum(precisions))) > IDENTIFICATION.velocity_z_min
+    return min(mean, IDENTIFICATION.velocity_max_width_s**2 / 12.0) if is_significant else 0.0
 
 
 def _box_velocities(windows: PredictionWindows) -> FloatArray:

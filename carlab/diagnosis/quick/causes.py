@@ -26,7 +26,7 @@ from carlab.diagnosis.identification.fit_parameters import (
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import is_applicable
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import DEFAULT, QuickSettings
+from carlab.diagnosis.settings import QUICK
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
@@ -90,70 +90,65 @@ class _Tested:
     halves: tuple[Fit, Fit]
 
 
-def find_causes(
-    windows: PredictionWindows, floor: FloatArray, simulator: SimulatorConfig, settings: QuickSettings = DEFAULT.quick
-) -> tuple[Cause, ...]:
+def find_causes(windows: PredictionWindows, floor: FloatArray, simulator: SimulatorConfig) -> tuple[Cause, ...]:
     """The most likely causes, the best first.
 
     Args:
         windows: windows of recordings that the simulator does not explain.
         floor: noise floor along a window (K + 1, 6).
         simulator: the simulator without the causes.
-        settings: amount of work and thresholds.
     """
-    fitter = Fitter(windows, scale_of(windows, floor, settings))
-    reference = fitter.loss(simulator, max_error=settings.max_left_out_error)
+    fitter = Fitter(windows, scale_of(windows, floor))
+    reference = fitter.loss(simulator, max_error=QUICK.max_left_out_error)
     perfect = 0.5 * len(fitter.scale.steps) * 6 * len(windows)
     excess = max(float(reference.sum()) - perfect, 1e-9)
     halves = _halves(windows)
-    singles = _fit_singles(fitter, simulator, settings)
-    best = sorted(singles, key=lambda c: c.fit.cost)[: settings.max_tested]
-    tested = [_test(fitter, c, halves, settings) for c in best]
+    singles = _fit_singles(fitter, simulator)
+    best = sorted(singles, key=lambda c: c.fit.cost)[: QUICK.max_tested]
+    tested = [_test(fitter, c, halves) for c in best]
     before = reference
     largest = max((float((reference - t.loss).sum()) for t in tested), default=-math.inf)
-    if largest < settings.single_cause_share * excess:
-        refit, added = _fit_with_refit(fitter, simulator, settings)
-        refitted = _test(fitter, refit, halves, settings)
+    if largest < QUICK.single_cause_share * excess:
+        refit, added = _fit_with_refit(fitter, simulator)
+        refitted = _test(fitter, refit, halves)
         before = refitted.loss
-        tested += [refitted, *(_test(fitter, c, halves, settings) for c in added)]
+        tested += [refitted, *(_test(fitter, c, halves) for c in added)]
     tested.sort(key=lambda t: float(t.loss.sum()))
     causes, seen = list[Cause](), set[str]()
     for t in tested:
         share = own_share = min(float((reference - t.loss).sum()) / excess, 1.0)
         if t.candidate.with_refit:
-            own_share = _own_share(before, t.loss, perfect, windows, settings)
-        min_own_share = settings.min_additional_share if t.candidate.with_refit else settings.min_share
-        relevant = share >= settings.min_share and own_share >= min_own_share
-        if t.candidate.id in seen or not relevant or len(causes) == settings.max_causes:
+            own_share = _own_share(before, t.loss, perfect, windows)
+        min_own_share = QUICK.min_additional_share if t.candidate.with_refit else QUICK.min_share
+        relevant = share >= QUICK.min_share and own_share >= min_own_share
+        if t.candidate.id in seen or not relevant or len(causes) == QUICK.max_causes:
             continue
         difference, error = clustered_gain(t.loss, tested[0].loss, windows)
-        ties = bool(causes) and difference < settings.tie_z * error
+        ties = bool(causes) and difference < QUICK.tie_z * error
         seen.add(t.candidate.id)
-        values = _reported_values(t, simulator, settings)
+        values = _reported_values(t, simulator)
         causes.append(Cause(t.candidate.id, share, own_share, t.candidate.with_refit, ties, values))
     return tuple(causes)
 
 
-def scale_of(windows: PredictionWindows, floor: FloatArray, settings: QuickSettings) -> Scale:
+def scale_of(windows: PredictionWindows, floor: FloatArray) -> Scale:
     """Steps whose errors enter a fit, with their noise floor; ``floor`` (K + 1, 6) is that along a window."""
-    steps = np.unique(np.linspace(windows.steps / settings.used_steps, windows.steps, settings.used_steps).round())
+    steps = np.unique(np.linspace(windows.steps / QUICK.used_steps, windows.steps, QUICK.used_steps).round())
     steps = steps.astype(int)
     return Scale(steps, floor[steps])
 
 
-def _own_share(
-    before: FloatArray, after: FloatArray, perfect: float, windows: PredictionWindows, settings: QuickSettings
-) -> float:
+def _own_share(before: FloatArray, after: FloatArray, perfect: float, windows: PredictionWindows) -> float:
     """Share that an effect explains of the excess after a refit; 0 if it is not significant."""
     gain, error = clustered_gain(before, after, windows)
     excess = float(before.sum()) - perfect
-    significant = gain > settings.min_additional_z * error
+    significant = gain > QUICK.min_additional_z * error
     return min(gain / excess, 1.0) if excess > 0.0 and significant else 0.0
 
 
-def _fit_singles(fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings) -> list[_Candidate]:
+def _fit_singles(fitter: Fitter, simulator: SimulatorConfig) -> list[_Candidate]:
     """Single causes with the best screening scores, each fitted alone."""
-    screen = Screen(fitter, simulator, fitter.fit(simulator, ()), settings.screened_windows)
+    screen = Screen(fitter, simulator, fitter.fit(simulator, ()), QUICK.screened_windows)
     screened: list[tuple[float, str, SimulatorConfig, tuple[FitParameter, ...], FloatArray]] = []
     for name in _new_effects(simulator):
         free = effect_parameters(name, simulator)
@@ -164,9 +159,9 @@ def _fit_singles(fitter: Fitter, simulator: SimulatorConfig, settings: QuickSett
         screened.append((score, name, simulator, free, start[None]))
     screened.sort(key=lambda entry: -entry[0])
     found = []
-    for _, name, config, free, starts in screened[: settings.max_single_fits]:
+    for _, name, config, free, starts in screened[: QUICK.max_single_fits]:
         start = fitter.best_point(config, free, starts)
-        fit = fitter.fit(config, free, start, iterations=settings.fit_iterations)
+        fit = fitter.fit(config, free, start, iterations=QUICK.fit_iterations)
         found.append(_Candidate(name, config, free, fit))
     return found
 
@@ -185,40 +180,34 @@ def _screen_parameters(
     return gains[best][0] / screen.share, at + (points[best] - at) * min(max(gains[best][1], low), high)
 
 
-def _fit_with_refit(
-    fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings
-) -> tuple[_Candidate, list[_Candidate]]:
+def _fit_with_refit(fitter: Fitter, simulator: SimulatorConfig) -> tuple[_Candidate, list[_Candidate]]:
     """Refit all parameters, and add the effects with the best screening scores to the refit."""
     own = [f for name in stated_effects(simulator) for f in effect_parameters(name, simulator)]
     free = (*base_parameters(simulator), *own)
-    refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=settings.fit_iterations)
-    screen = Screen(fitter, simulator, refit, settings.screened_windows)
+    refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=QUICK.fit_iterations)
+    screen = Screen(fitter, simulator, refit, QUICK.screened_windows)
     screened = [screen.score(name, effect_parameters(name, simulator)) for name in _new_effects(simulator)]
     screened.sort(key=lambda result: -result.score)
     found = []
-    for result in screened[: settings.max_additional_fits]:
+    for result in screened[: QUICK.max_additional_fits]:
         config = with_effect(simulator, result.effect)
         all_free = (*free, *effect_parameters(result.effect, simulator))
         start = np.concatenate([refit.z, result.starts[0]])
-        fit = fitter.fit(config, all_free, start, iterations=settings.fit_iterations)
+        fit = fitter.fit(config, all_free, start, iterations=QUICK.fit_iterations)
         found.append(_Candidate(result.effect, config, all_free, fit, with_refit=True))
     return _Candidate(ALL_PARAMETERS, simulator, free, refit), found
 
 
-def _test(
-    fitter: Fitter, candidate: _Candidate, halves: tuple[np.ndarray, np.ndarray], settings: QuickSettings
-) -> _Tested:
+def _test(fitter: Fitter, candidate: _Candidate, halves: tuple[np.ndarray, np.ndarray]) -> _Tested:
     """Two-fold cross-validation of a candidate."""
     loss = np.zeros(len(fitter.windows))
     fits = []
-    start, iterations = candidate.fit.z, settings.half_fit_iterations
+    start, iterations = candidate.fit.z, QUICK.half_fit_iterations
     for mine, others in (halves, halves[::-1]):
         own = Fitter(fitter.windows.take(mine), fitter.scale)
         fits.append(own.fit(candidate.config, candidate.free, start, iterations=iterations))
         left_out = Fitter(fitter.windows.take(others), fitter.scale)
-        loss[others] = left_out.loss(
-            candidate.config, candidate.free, fits[-1].z, max_error=settings.max_left_out_error
-        )
+        loss[others] = left_out.loss(candidate.config, candidate.free, fits[-1].z, max_error=QUICK.max_left_out_error)
     return _Tested(candidate, loss, (fits[0], fits[1]))
 
 
@@ -250,15 +239,13 @@ def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> Fl
     return np.array([f.coordinate(values[f.name]) for f in free])
 
 
-def _reported_values(
-    tested: _Tested, simulator: SimulatorConfig, settings: QuickSettings
-) -> dict[str, FittedParameterValue]:
+def _reported_values(tested: _Tested, simulator: SimulatorConfig) -> dict[str, FittedParameterValue]:
     candidate = tested.candidate
     before = simulator.values()
     whole, (first, second) = candidate.fit.values(), (half.values() for half in tested.halves)
     if candidate.id == ALL_PARAMETERS:
         ordered = sorted(candidate.free, key=lambda f: -_change(whole[f.name], before[f.name]))
-        names = [f.name for f in ordered[: settings.max_causes]]
+        names = [f.name for f in ordered[: QUICK.max_causes]]
     elif candidate.id == GRIP:
         names = list(GRIP_PARAMETERS)
     else:

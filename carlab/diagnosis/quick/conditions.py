@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.settings import DEFAULT, QuickSettings
+from carlab.diagnosis.settings import QUICK
 from carlab.prediction.windows import PredictionWindows
 
 BoolArray = NDArray[np.bool_]
@@ -30,30 +30,28 @@ class ErrorCondition:
     windows: int
 
 
-def find_conditions(
-    windows: PredictionWindows, size: FloatArray, settings: QuickSettings = DEFAULT.quick
-) -> tuple[ErrorCondition, ...]:
+def find_conditions(windows: PredictionWindows, size: FloatArray) -> tuple[ErrorCondition, ...]:
     """Conditions in which errors ``size`` (S,) are significantly larger than elsewhere, the most significant first.
 
     Of conditions of one kind (thresholds of a feature, places) only the most significant is returned.
     """
     best: dict[str, tuple[float, ErrorCondition]] = {}
-    for kind, text, inside in _candidates(windows, settings):
-        if min(inside.sum(), (~inside).sum()) < settings.condition_windows_min:
+    for kind, text, inside in _candidates(windows):
+        if min(inside.sum(), (~inside).sum()) < QUICK.condition_windows_min:
             continue
         squared = size**2
         within, outside = squared[inside], squared[~inside]
         error = np.sqrt(within.var() / len(within) + outside.var() / len(outside))
         z = float(within.mean() - outside.mean()) / max(float(error), 1e-9)
         found = ErrorCondition(text, float(np.sqrt(within.mean())), float(np.sqrt(outside.mean())), int(inside.sum()))
-        if found.inside < settings.condition_ratio_min * found.outside or z < settings.condition_z_min:
+        if found.inside < QUICK.condition_ratio_min * found.outside or z < QUICK.condition_z_min:
             continue
         if kind not in best or z > best[kind][0]:
             best[kind] = (z, found)
-    return tuple(c for _, c in sorted(best.values(), key=lambda b: -b[0]))[: settings.max_conditions]
+    return tuple(c for _, c in sorted(best.values(), key=lambda b: -b[0]))[: QUICK.max_conditions]
 
 
-def _candidates(windows: PredictionWindows, settings: QuickSettings) -> Iterator[tuple[str, str, BoolArray]]:
+def _candidates(windows: PredictionWindows) -> Iterator[tuple[str, str, BoolArray]]:
     commands = windows.commands
     steering, throttle = commands[:, :, 0], commands[:, :, 1]
     ahead = windows.measured[:, :, 3]
@@ -83,15 +81,15 @@ def _candidates(windows: PredictionWindows, settings: QuickSettings) -> Iterator
     late = windows.t0_s > np.median(windows.t0_s)
     yield "time", f"later than {np.median(windows.t0_s):.1f} s of an episode", late
     yield "time", f"before {np.median(windows.t0_s):.1f} s of an episode", ~late
-    yield from _places(windows, settings)
+    yield from _places(windows)
 
 
-def _places(windows: PredictionWindows, settings: QuickSettings) -> Iterator[tuple[str, str, BoolArray]]:
+def _places(windows: PredictionWindows) -> Iterator[tuple[str, str, BoolArray]]:
     paths = windows.measured[:, :, :2]
     cells = (
-        np.unique(np.round(paths.reshape(-1, 2) / settings.place_spacing_m).astype(np.int64), axis=0)
-        * settings.place_spacing_m
+        np.unique(np.round(paths.reshape(-1, 2) / QUICK.place_spacing_m).astype(np.int64), axis=0)
+        * QUICK.place_spacing_m
     )
     for x, y in cells:
-        near = (np.hypot(paths[..., 0] - x, paths[..., 1] - y) < settings.place_radius_m).any(axis=1)
-        yield "place", f"within {settings.place_radius_m:.1f} m of ({x:.1f}, {y:.1f})", near
+        near = (np.hypot(paths[..., 0] - x, paths[..., 1] - y) < QUICK.place_radius_m).any(axis=1)
+        yield "place", f"within {QUICK.place_radius_m:.1f} m of ({x:.1f}, {y:.1f})", near

@@ -20,14 +20,13 @@ from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
-from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
+from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.quick.causes import Cause, find_causes, scale_of
 from carlab.diagnosis.quick.conditions import ErrorCondition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
-from carlab.diagnosis.settings import DEFAULT, QuickSettings
+from carlab.diagnosis.settings import QUICK
 from carlab.diagnosis.state_alignment import align_states, lost_frames, window_variance_s2, with_known_latency
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.initial_states import without_curvature_bias
+from carlab.prediction.errors import bounded, prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
@@ -72,7 +71,7 @@ class QuickCheck:
     why: str = ""
     score: float = float("nan")
     score_std: float = float("nan")
-    horizon_s: float = DEFAULT.quick.window_s
+    horizon_s: float = QUICK.window_s
     channels: tuple[ChannelScore, ...] = ()
     conditions: tuple[ErrorCondition, ...] = ()
     causes: tuple[Cause, ...] = ()
@@ -90,21 +89,18 @@ class QuickCheck:
         return dict(plain({"schema": SCHEMA, **asdict(self), "excess": self.excess}, JSON_KEYS))
 
 
-def quick_check(
-    episodes: Sequence[EpisodeData], simulator: SimulatorConfig, settings: QuickSettings = DEFAULT.quick
-) -> QuickCheck:
+def quick_check(episodes: Sequence[EpisodeData], simulator: SimulatorConfig) -> QuickCheck:
     """Check recordings against a simulator.
 
     Args:
         episodes: recordings as read; states of carlab recordings are aligned to the latency of ``simulator``.
         simulator: with its effects.
-        settings: thresholds and amount of work.
 
     Returns:
         The result; "undecided" if the recordings are not sufficient.
     """
     seconds = sum(e.ticks * e.period_s for e in episodes if e.ticks > 0)
-    undecided = QuickCheck("undecided", horizon_s=settings.window_s, episodes=len(episodes), seconds=float(seconds))
+    undecided = QuickCheck("undecided", horizon_s=QUICK.window_s, episodes=len(episodes), seconds=float(seconds))
     usable = [e for e in episodes if e.ticks >= 2]
     if not usable:
         return replace(undecided, why="they contain no commands.")
@@ -115,25 +111,22 @@ def quick_check(
     if unusable:
         return replace(undecided, why=f"they are faulty ({unusable[0].id} of {unusable[0].channel}).")
     try:
-        windows, floor = _windows(repaired, simulator, window_variance_s2(usable), settings)
+        windows, floor = _windows(repaired, simulator, window_variance_s2(usable))
     except DataError:
-        length_s = settings.window_s + MIN_HISTORY_S
+        length_s = QUICK.window_s + MIN_HISTORY_S
         why = f"the car moves in no stretch of {length_s:.1f} s without a gap"
         return replace(undecided, why="; ".join(filter(None, (why, lost_frames(captured)[1]))) + ".")
-    if len(windows) < settings.min_windows:
-        return replace(undecided, why=f"the car moves in only {len(windows)} windows of {settings.window_s:.1f} s.")
-    return _checked(undecided, windows, floor, simulator, settings)
+    if len(windows) < QUICK.min_windows:
+        return replace(undecided, why=f"the car moves in only {len(windows)} windows of {QUICK.window_s:.1f} s.")
+    return _checked(undecided, windows, floor, simulator)
 
 
-def held_out_loss(
-    episode: EpisodeData, simulators: Sequence[SimulatorConfig], settings: QuickSettings = DEFAULT.quick
-) -> list[float] | None:
+def held_out_loss(episode: EpisodeData, simulators: Sequence[SimulatorConfig]) -> list[float] | None:
     """Huber's loss of an episode's windows by each simulator, in units of the noise floor of the first.
 
     Args:
         episode: a recording that no simulator was fitted to.
         simulators: to compare.
-        settings: windows and bound of an error.
 
     Returns:
         One loss for each simulator; None if the car moves in no window.
@@ -142,11 +135,11 @@ def held_out_loss(
     captured = [align_states(episode, first.latency_s())] if episode.ticks >= 2 else []
     repaired, _, _ = data_faults.check(captured, [], with_known_latency(first, captured))
     try:
-        windows, floor = _windows(repaired, first, window_variance_s2([episode]), settings)
+        windows, floor = _windows(repaired, first, window_variance_s2([episode]))
     except DataError:
         return None
-    fitter = Fitter(windows, scale_of(windows, floor, settings))
-    return [float(fitter.loss(each, max_error=settings.max_left_out_error).sum()) for each in simulators]
+    fitter = Fitter(windows, scale_of(windows, floor))
+    return [float(fitter.loss(each, max_error=QUICK.max_left_out_error).sum()) for each in simulators]
 
 
 def _checked(
@@ -154,41 +147,38 @@ def _checked(
     windows: PredictionWindows,
     floor: FloatArray,
     simulator: SimulatorConfig,
-    settings: QuickSettings,
 ) -> QuickCheck:
     """Check windows with their noise floor (K + 1, 6)."""
     last = prediction_errors(simulate_windows(windows, simulator), windows)[0, :, -1]
-    limit = settings.max_error
-    final = np.nan_to_num(last / floor[-1], nan=limit).clip(-limit, limit)
+    final = bounded(last / floor[-1], QUICK.max_error)
     score, score_std = _score(final, windows)
     channels = _channels(final, floor[-1])
     scored = replace(undecided, score=score, score_std=score_std, channels=channels, windows=len(windows))
-    if score <= settings.score_max:
+    if score <= QUICK.score_max:
         return replace(scored, verdict="explains")
-    if _blocks_above(final, windows, settings.score_max) < settings.min_blocks:
+    if _blocks_above(final, windows, QUICK.score_max) < QUICK.min_blocks:
         why = "the errors exceed the noise in one stretch only, which may be an outlier."
         return replace(scored, why=why)
     worst = STATE_NAMES.index(channels[0].channel)
     return replace(
         scored,
         verdict="left",
-        conditions=find_conditions(windows, np.abs(final[:, worst]), settings),
-        causes=find_causes(windows, floor, simulator, settings),
+        conditions=find_conditions(windows, np.abs(final[:, worst])),
+        causes=find_causes(windows, floor, simulator),
     )
 
 
 def _windows(
-    episodes: Sequence[EpisodeData], simulator: SimulatorConfig, window_s2: float | None, settings: QuickSettings
+    episodes: Sequence[EpisodeData], simulator: SimulatorConfig, window_s2: float | None
 ) -> tuple[PredictionWindows, FloatArray]:
     """Windows of all recordings, and the noise floor along them (K + 1, 6). Raises DataError without windows."""
     segments = segments_of([e for e in episodes if e.ticks >= 2])
     if not segments:
         raise DataError("No recording has an unbroken stretch of half a second.")
-    few = len({t.recording for t in segments}) < settings.few_episodes
-    block_s = settings.short_block_s if few else settings.block_s
-    windows = cut_windows(segments, settings.window_s, settings.stride_s, block_s).thinned(settings.max_windows)
-    variance_s2 = velocity_window_variance_s2(windows, simulator) if window_s2 is None else window_s2
-    windows = without_curvature_bias(replace(windows, velocity_window_s2=variance_s2), simulator)
+    few = len({t.recording for t in segments}) < QUICK.few_episodes
+    block_s = QUICK.short_block_s if few else QUICK.block_s
+    windows = cut_windows(segments, QUICK.window_s, QUICK.stride_s, block_s).thinned(QUICK.max_windows)
+    (windows,) = with_initial_states((windows,), simulator, window_s2)
     return windows, noise_floor(windows, estimate_noise(segments, windows.curvature_bias), simulator)
 
 

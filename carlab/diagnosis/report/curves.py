@@ -12,7 +12,7 @@ from carlab.diagnosis.report.figures import Figure
 from carlab.diagnosis.report.residual import relevant_residual, remaining_share
 from carlab.diagnosis.report.sentences import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.svg import Chart, padded
-from carlab.diagnosis.settings import DEFAULT, ReportSettings
+from carlab.diagnosis.settings import DEFAULT, REPORT
 from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.effects.curves import DriveMap
 
@@ -29,7 +29,7 @@ def curve_sentences(diagnosis: Diagnosis) -> list[str]:
         made.append(_largest_difference(curve))
         made.append(form_sentence(curve))
         if curve.id == DriveMap.id:
-            made += readings_of_drive(curve, DEFAULT.report)
+            made += readings_of_drive(curve)
     return [sentence for sentence in (*made, *_trial_sentences(diagnosis)) if sentence]
 
 
@@ -138,7 +138,7 @@ def form_sentence(curve: CurveFinding) -> str:
     return f"{text}{': ' * bool(values)}{', '.join(values)} ({misfit}).{others}"
 
 
-def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str]:
+def readings_of_drive(curve: CurveFinding) -> list[str]:
     """What a drive map shows: braking with released throttle, speeds that a throttle holds, saturation."""
     throttle, speed = (np.array(axis.knots) for axis in curve.axes)
     found = []
@@ -146,7 +146,7 @@ def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str
     moving = (speed > 0.0) & np.isfinite(curve.measured[released])
     braking, own = (-a[released, moving] for a in (curve.measured, curve.car_file))
     std = curve.std[released, moving]
-    if moving.sum() >= 2 and (braking - own > settings.reading_z_min * std)[:2].all():
+    if moving.sum() >= 2 and (braking - own > REPORT.reading_z_min * std)[:2].all():
         found.append(
             f"With the throttle released, the motor brakes with {number(float(braking.min()))} to "
             f"{number(float(braking.max()))} m/s² from {number(float(speed[moving].min()))} to "
@@ -154,7 +154,7 @@ def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str
             f"{number(float(own.max()))} m/s²)."
         )
     rows = zip(throttle, curve.measured, curve.car_file, strict=True)
-    held = [(u, v) for u, row, base in rows if u > 0.0 and (v := _held_speed(speed, row, base, settings))]
+    held = [(u, v) for u, row, base in rows if u > 0.0 and (v := _held_speed(speed, row, base))]
     if len(held) >= 2 and all(a[1] < b[1] for a, b in itertools.pairwise(held)):
         pairs = ", ".join(f"{number(v)} m/s at throttle {number(u)}" for u, v in held)
         found.append(f"The motor holds a speed rather than a force: {pairs}.")
@@ -162,14 +162,12 @@ def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str
     driven = (speed >= 0.0) & np.isfinite(high) & np.isfinite(full)
     growth = (full - high)[driven]
     expected = (curve.car_file[-1] - curve.car_file[-2])[driven]
-    if driven.sum() >= 2 and float(np.median(growth)) < settings.saturation_share * float(np.median(expected)):
+    if driven.sum() >= 2 and float(np.median(growth)) < REPORT.saturation_share * float(np.median(expected)):
         found.append(f"Above a throttle of {number(float(throttle[-2]))} the drive force hardly grows: it saturates.")
     return found
 
 
-def _held_speed(
-    speed: FloatArray, measured: FloatArray, car_file: FloatArray, settings: ReportSettings
-) -> float | None:
+def _held_speed(speed: FloatArray, measured: FloatArray, car_file: FloatArray) -> float | None:
     """Speed above 0 at which a controller holds the car; None without one between knots with data.
 
     The acceleration falls through 0 there, several times as steeply as that of the car file: any motor with damping has
@@ -178,7 +176,7 @@ def _held_speed(
     for k in range(len(speed) - 1):
         before, after = measured[k], measured[k + 1]
         if speed[k] >= 0.0 and np.isfinite(before) and np.isfinite(after) and before > 0.0 >= after:
-            is_steep = before - after > settings.holding_slope_ratio * (car_file[k] - car_file[k + 1])
+            is_steep = before - after > REPORT.holding_slope_ratio * (car_file[k] - car_file[k + 1])
             return float(speed[k] + (speed[k + 1] - speed[k]) * before / (before - after)) if is_steep else None
     return None
 

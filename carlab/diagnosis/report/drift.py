@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from carlab.diagnosis.findings import Diagnosis, Drift, QuantityChange
 from carlab.diagnosis.report.numbers import listed, number, percent, with_unit
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DRIFT
 
 
 def has_changed(diagnosis: Diagnosis, recording: int) -> bool:
@@ -13,7 +13,7 @@ def has_changed(diagnosis: Diagnosis, recording: int) -> bool:
 
 
 def _is_in_similar_states(drift: Drift) -> bool:
-    return drift.similar_share >= DEFAULT.drift.min_similar_share
+    return drift.similar_share >= DRIFT.min_similar_share
 
 
 def drift_sentence(drift: Drift, horizon_s: float) -> str:

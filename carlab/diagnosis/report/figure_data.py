@@ -13,7 +13,7 @@ from carlab.diagnosis.events import Event
 from carlab.diagnosis.evidence import ScoredSearch, scores_by_step
 from carlab.diagnosis.findings import FigureData, Trace
 from carlab.diagnosis.recordings import SplitRecordings
-from carlab.diagnosis.settings import ReportSettings
+from carlab.diagnosis.settings import REPORT
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import predicted_at, simulate_windows
@@ -27,10 +27,10 @@ TRACES_TRIED = 6
 
 def figure_data_of(scored: ScoredSearch, recordings: SplitRecordings) -> FigureData:
     """Data of the figures."""
-    settings, found = scored.problem.settings.report, scored.found
+    found = scored.found
     correlation = {
-        name: _correlation(scored.problem.windows, found.base.config, EFFECTS[name].command == "throttle", settings)
-        for name in found.effects[: settings.max_correlations]
+        name: _correlation(scored.problem.windows, found.base.config, EFFECTS[name].command == "throttle")
+        for name in found.effects[: REPORT.max_correlations]
     }
     candidates = tuple(
         (c.effect, c.standard_errors if c.is_tested else math.nan, float(c.fit.loss.sum()))
@@ -63,11 +63,11 @@ def _regimes(scored: ScoredSearch) -> dict[str, tuple[FloatArray, FloatArray, Fl
 
 
 def _correlation(
-    windows: PredictionWindows, config: SimulatorConfig, on_throttle: bool, settings: ReportSettings
+    windows: PredictionWindows, config: SimulatorConfig, on_throttle: bool
 ) -> tuple[FloatArray, FloatArray, float]:
     """Correlation of the missing acceleration with the rate of a command at lags [s], and its 99 % bound."""
     error = prediction_errors(simulate_windows(windows, config), windows)[0]
-    step = min(max(round(settings.correlation_step_s / windows.period_s), 1), windows.steps)
+    step = min(max(round(REPORT.correlation_step_s / windows.period_s), 1), windows.steps)
     column = 3 if on_throttle else 5
     missing = -error[:, step, column] / (step * windows.period_s)
     recent = windows.past_commands[:, -history_rows(windows.period_s, MIN_HISTORY_S) :]
@@ -78,7 +78,7 @@ def _correlation(
         rate = command[:, -1 - lag] - command[:, -2 - lag]
         values.append(float(np.corrcoef(rate, missing)[0, 1]) if rate.std() > 1e-9 else 0.0)
     blocks = len(np.unique(windows.block))
-    return lags * windows.period_s, np.array(values), settings.correlation_z / math.sqrt(max(blocks, 1))
+    return lags * windows.period_s, np.array(values), REPORT.correlation_z / math.sqrt(max(blocks, 1))
 
 
 def _traces(scored: ScoredSearch, recordings: SplitRecordings) -> tuple[Trace, ...]:
@@ -88,18 +88,16 @@ def _traces(scored: ScoredSearch, recordings: SplitRecordings) -> tuple[Trace, .
         "refit": scored.found.base.config,
         "with_effects": scored.found.best.config,
     }
-    settings = scored.problem.settings
-    horizon_s, worst = settings.windows.held_out_window_s, settings.report.worst_stretches
+    horizon_s = scored.problem.settings.windows.held_out_window_s
     longest = sorted(recordings.held_out_segments, key=lambda segment: -len(segment.t_s))[:TRACES_TRIED]
     events = recordings.events.found
-    traces = [t for segment in longest if (t := _trace(segment, models, horizon_s, worst, events)) is not None]
+    traces = [t for segment in longest if (t := _trace(segment, models, horizon_s, events)) is not None]
     fitted = [
         Trace(f"fitted recording {segment.recording + 1}", segment.t_s, segment.states, {}, (), own)
         for segment in recordings.fit_segments
         if (own := _events_in(segment, events, "fit"))
     ]
-    count = settings.report.max_traces
-    return (*traces[:count], *fitted[:count])
+    return (*traces[: REPORT.max_traces], *fitted[: REPORT.max_traces])
 
 
 def _events_in(segment: RecordingSegment, events: Sequence[Event], role: str) -> tuple[Event, ...]:
@@ -112,7 +110,6 @@ def _trace(
     segment: RecordingSegment,
     models: Mapping[str, SimulatorConfig],
     horizon_s: float,
-    worst_stretches: int,
     events: Sequence[Event],
 ) -> Trace | None:
     """Predictions along a segment, restarted every horizon; None if the car does not move for a horizon."""
@@ -128,7 +125,7 @@ def _trace(
         predicted[name] = predicted_at(segment.t_s, windows, out[0])
         if name == "refit":
             final = np.linalg.norm(prediction_errors(out, windows)[0, :, -1, :2], axis=1)
-            order = [k for k in np.argsort(-final) if not windows.in_event[k]][:worst_stretches]
+            order = [k for k in np.argsort(-final) if not windows.in_event[k]][: REPORT.worst_stretches]
             worst = [(float(windows.t0_s[k]), float(windows.t0_s[k] + span_s)) for k in order]
     own = _events_in(segment, events, "held out")
     return Trace(

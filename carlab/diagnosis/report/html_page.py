@@ -17,7 +17,7 @@ from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.diagnosis.report.residual import explained_share, relevant_residual, shown_errors
 from carlab.diagnosis.report.svg import interval_bar
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE, REPORT
 
 
 def render_page(diagnosis: Diagnosis, figure_data: FigureData) -> str:
@@ -44,7 +44,8 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
     return {
         "d": diagnosis,
         "title": text.verdict_title(diagnosis),
-        "sentence": diagnosis.sentence if _has_own_sentence(diagnosis) else text.verdict_sentence(diagnosis),
+        # That of an inconclusive diagnosis is a reason, not a verdict.
+        "sentence": text.verdict_sentence(diagnosis) if diagnosis.verdict == "inconclusive" else diagnosis.sentence,
         "cards": _cards(diagnosis),
         "effects": [_effect(effect, figure_data) for effect in diagnosis.effects],
         "overlay": figures.overlay(*worst, diagnosis.effects) if worst else [],
@@ -58,12 +59,12 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "explained": explained_share(diagnosis),
         "known": bool(diagnosis.effects) and math.isfinite(explained_share(diagnosis)),
         "driven": bool(figure_data.traces),
-        "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
+        "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: REPORT.max_candidates]],
         "candidate_count": len(figure_data.candidates),
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),
-        "min_windows": DEFAULT.evidence.skill_windows_min,
+        "min_windows": EVIDENCE.skill_windows_min,
         "drift": [(d, figures.drift_charts(d)) for d in diagnosis.drift],
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),
@@ -84,11 +85,6 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         ],
         "channels": text.CHANNEL_NAMES,
     }
-
-
-def _has_own_sentence(diagnosis: Diagnosis) -> bool:
-    """Whether the diagnosis has a verdict sentence; that of an inconclusive one is a reason, not a verdict."""
-    return bool(diagnosis.sentence) and diagnosis.verdict != "inconclusive"
 
 
 def _bar(e: Estimate) -> Any:
@@ -113,14 +109,11 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     if where.place is not None:
         x, y, radius = (text.with_unit(v, "m") for v in where.place)
         places.append(f"within {radius} of x = {x}, y = {y}")
-    drive = ""
-    if effect.indistinguishable_from:
-        drive = effect.separating_drive or text.separating_drive(effect.id, effect.indistinguishable_from)
     noun = text.effect_noun(effect.id)
     return {
         "id": effect.id,
         "noun": noun[0].upper() + noun[1:],
-        "sentence": effect.sentence or text.effect_sentence(effect.id, effect.parameters, effect.car_file_values),
+        "sentence": effect.sentence,
         "confidence": effect.confidence,
         "confidence_text": text.confidence_text(effect.confidence, len(effect.indistinguishable_from)),
         "where": ", ".join(places),
@@ -128,7 +121,7 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
         "evidence_texts": _evidence_texts(effect),
         "parameters": [(name, e, _bar(e)) for name, e in effect.parameters.items()],
         "others": [(other, text.effect_noun(other)) for other in effect.indistinguishable_from],
-        "drive": drive_command(drive),
+        "drive": drive_command(effect.separating_drive),
         "reason": text.separating_reason(effect.id, effect.indistinguishable_from)
         if effect.indistinguishable_from
         else "",

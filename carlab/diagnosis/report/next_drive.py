@@ -1,24 +1,31 @@
-"""The drive that a report advises, and its command."""
+"""The texts of a diagnosis: its sentences, and the drive that it advises."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis
 from carlab.diagnosis.report.numbers import listed
 from carlab.diagnosis.report.residual import differs_when_held_out, relevant_residual, remaining_share
-from carlab.diagnosis.report.sentences import effect_noun, separating_drive, separating_reason
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.report.sentences import (
+    effect_noun,
+    effect_sentence,
+    separating_drive,
+    separating_reason,
+    verdict_sentence,
+)
+from carlab.diagnosis.settings import EVIDENCE
 
 
 def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
     """The manoeuvre to drive next (empty if none would help) and the reason."""
     for effect in diagnosis.effects:
         if effect.indistinguishable_from:
-            drive = effect.separating_drive
-            drive = drive if drive in MANOEUVRES else separating_drive(effect.id, effect.indistinguishable_from)
             reason = separating_reason(effect.id, effect.indistinguishable_from)
             others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
-            return drive, f"These recordings do not distinguish {effect_noun(effect.id)} from {others}. {reason}"
+            why = f"These recordings do not distinguish {effect_noun(effect.id)} from {others}. {reason}"
+            return separating_drive(effect.id, effect.indistinguishable_from), why
     advice = diagnosis.advice or (diagnosis.sentence if diagnosis.verdict == "inconclusive" else "")
     if diagnosis.verdict == "data":
         return "", advice or "Correct the recording or record again. Then diagnose again."
@@ -37,7 +44,7 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
         cut_short = "without a stop" if search.stopped_by == "user" else "with a longer time limit"
         how = "without --effects" if search.effects else cut_short
         return "", f"Diagnose these recordings again {how}, before another drive."
-    is_described = remaining_share(diagnosis) < DEFAULT.evidence.unexplained_share_min
+    is_described = remaining_share(diagnosis) < EVIDENCE.unexplained_share_min
     if rest is not None and not is_described:
         channels = rest.channels
         along = bool(channels) and channels[0] in ("x", "vx")
@@ -56,3 +63,19 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
 def drive_command(manoeuvre: str) -> str:
     """The command line that drives a manoeuvre; empty for none."""
     return f"carlab drive --policy {manoeuvre} --no-place" if manoeuvre else ""
+
+
+def with_texts(diagnosis: Diagnosis) -> Diagnosis:
+    """The diagnosis with its sentences, separating drives and advice."""
+    effects = tuple(
+        replace(
+            e,
+            sentence=effect_sentence(e.id, e.parameters, e.car_file_values),
+            separating_drive=separating_drive(e.id, e.indistinguishable_from),
+        )
+        for e in diagnosis.effects
+    )
+    diagnosis = replace(diagnosis, sentence=verdict_sentence(diagnosis), effects=effects)
+    drive, why = next_drive(diagnosis)
+    command = drive_command(drive)
+    return replace(diagnosis, advice=f"{why} Drive it with: {command}" if command else why)

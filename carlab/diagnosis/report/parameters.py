@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from carlab.diagnosis.findings import Diagnosis, Estimate
 from carlab.diagnosis.report.numbers import listed, with_unit
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
 
 
@@ -20,7 +20,7 @@ def wrong_parameters(diagnosis: Diagnosis) -> str:
         and not (e.at_limit or e.low90 <= diagnosis.car_file_parameters[name] <= e.high90)
     }
     largest = sorted(differences, key=lambda name: -differences[name])
-    shown = largest[: DEFAULT.report.max_wrong_parameters]
+    shown = largest[: REPORT.max_wrong_parameters]
     parts = []
     for name in shown:
         e, stated = diagnosis.parameters[name], diagnosis.car_file_parameters[name]
@@ -54,7 +54,7 @@ def excluded_sizes(diagnosis: Diagnosis) -> str:
             continue
         estimate = own[parameter.name]
         found.append((_largest(estimate) / abs(parameter.typical), EFFECTS[effect].name, estimate))
-    narrowest = sorted(found, key=lambda each: each[0])[: DEFAULT.report.max_limits]
+    narrowest = sorted(found, key=lambda each: each[0])[: REPORT.max_limits]
     if not narrowest:
         return ""
     sizes = [f"{name} beyond {with_unit(_largest(e), e.unit)}" for _, name, e in narrowest]

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import REPORT
 from carlab.recording.rerun import blueprint
 
 ORDER = ("nominal", "refit", "with_effects")
@@ -47,11 +47,10 @@ def draw_picture(diagnosis: Diagnosis, figure_data: FigureData, path: Path) -> N
     for axes, trace in zip(panes[1:], shown, strict=False):
         _worst(axes, trace)
     names = (
-        ", ".join(e.id.replace("_", " ") for e in diagnosis.effects[: DEFAULT.report.max_picture_names])
-        or diagnosis.verdict
+        ", ".join(e.id.replace("_", " ") for e in diagnosis.effects[: REPORT.max_picture_names]) or diagnosis.verdict
     )
-    if len(diagnosis.effects) > DEFAULT.report.max_picture_names:
-        names += f" and {len(diagnosis.effects) - DEFAULT.report.max_picture_names} more"
+    if len(diagnosis.effects) > REPORT.max_picture_names:
+        names += f" and {len(diagnosis.effects) - REPORT.max_picture_names} more"
     figure.suptitle(_escaped(names), fontsize=11)
     figure.savefig(path, dpi=110)
 

@@ -24,7 +24,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
 from carlab.diagnosis.report.events import event_label
 from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
-from carlab.diagnosis.report.sentences import number, verdict_sentence
+from carlab.diagnosis.report.sentences import number
 from carlab.recording.atomic_files import rerun_file
 from carlab.recording.rerun import blueprint
 from carlab.recording.rerun.columns import Columns, entity_part, yaw_quaternion
@@ -67,7 +67,7 @@ def entity_names(figure_data: FigureData) -> list[str]:
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
-    lines = [f"# {diagnosis.verdict}", diagnosis.sentence or verdict_sentence(diagnosis)]
+    lines = [f"# {diagnosis.verdict}", diagnosis.sentence]
     lines += [f"- {effect.sentence}" for effect in diagnosis.effects]
     if diagnosis.advice:
         lines += ["**Next:** " + diagnosis.advice]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, final_model_name
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE, REPORT
 
 
 def explained_share(diagnosis: Diagnosis, model: str = "with_effects") -> float:
@@ -30,12 +30,12 @@ def shown_errors(diagnosis: Diagnosis) -> dict[str, FitErrors]:
 def is_above_noise(diagnosis: Diagnosis, model: str) -> bool:
     """Whether the score of a model is well above the noise floor."""
     held = diagnosis.held_out.get(model)
-    return held is not None and held.score > DEFAULT.report.score_above_noise
+    return held is not None and held.score > REPORT.score_above_noise
 
 
 def differs_when_held_out(diagnosis: Diagnosis) -> bool:
     """Whether a model without effects explains the fitted recordings, but not the held-out ones."""
-    return diagnosis.verdict == "unexplained" and diagnosis.fitted_score < DEFAULT.evidence.unexplained_score_min
+    return diagnosis.verdict == "unexplained" and diagnosis.fitted_score < EVIDENCE.unexplained_score_min
 
 
 def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
@@ -45,7 +45,7 @@ def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
     recordings have it.
     """
     rest = diagnosis.unexplained
-    if rest is None or rest.share < DEFAULT.evidence.unexplained_share_min or differs_when_held_out(diagnosis):
+    if rest is None or rest.share < EVIDENCE.unexplained_share_min or differs_when_held_out(diagnosis):
         return None
     if diagnosis.verdict in ("none", "parameters") and not is_above_noise(diagnosis, "refit"):
         return None

@@ -19,7 +19,7 @@ from carlab.diagnosis.report.numbers import with_unit as with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, parameters_at_limit, wrong_parameters
 from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import EVIDENCE, REPORT
 from sim_backends.effects import EFFECTS, Confusable, separation
 from sim_backends.registry import REGISTRY
 
@@ -250,15 +250,14 @@ def _with_curves(diagnosis: Diagnosis) -> str:
 
 def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
     """Where constant velocity predicts held-out recordings better than the model, and why; empty if nowhere."""
-    settings = DEFAULT.evidence
-    significant = [s for s in diagnosis.skill if s.standard_errors < -settings.skill_z_min]
+    significant = [s for s in diagnosis.skill if s.standard_errors < -EVIDENCE.skill_z_min]
     worse = [s for s in significant if s.model_m > s.constant_velocity_m]  # the mean and the rms may disagree
     if not worse:
         return ""
     whole = [s for s in worse if s.regime == "all"]
     worst = max(whole or worse, key=lambda s: s.model_m - s.constant_velocity_m)
     place = f"recording {worst.recording}" + ("" if worst.regime == "all" else f" at {worst.regime}")
-    steady = worst.constant_velocity_m < settings.steady_share * worst.travelled_m
+    steady = worst.constant_velocity_m < EVIDENCE.steady_share * worst.travelled_m
     why = (
         "Velocities hardly change there, so this drive does not separate the possible causes."
         if steady
@@ -327,7 +326,7 @@ def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
 
 def _warning_of_fitted(diagnosis: Diagnosis) -> str:
     """A warning if only the fitted recordings have an error well above the noise; else empty."""
-    if is_above_noise(diagnosis, "refit") or not diagnosis.fitted_score > DEFAULT.report.score_above_noise:
+    if is_above_noise(diagnosis, "refit") or not diagnosis.fitted_score > REPORT.score_above_noise:
         return ""
     return (
         f" On the fitted recordings, the error of the refit is {number(diagnosis.fitted_score)} noise floors: they "

@@ -17,7 +17,6 @@ from carlab.diagnosis.decisions import to_dict
 from carlab.diagnosis.findings import Diagnosis, FigureData
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.diagnosis.report.picture import draw_picture
 from carlab.diagnosis.report.rerun_recording import write_rrd
 from carlab.recording.atomic_files import write_text
@@ -35,8 +34,7 @@ COMMENT_CHARACTERS = 110
 def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, model: SimulatorConfig) -> None:
     """Write the whole report and replace an existing one.
 
-    Each file is written atomically. report.json is written last, so if it exists, all files exist. A diagnosis
-    without a sentence or advice gets those of ``report.sentences``.
+    Each file is written atomically. report.json is written last, so if it exists, all files exist.
 
     Args:
         diagnosis: the result.
@@ -48,10 +46,9 @@ def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, mo
         DataError: the folder cannot be created or written; the message states reason and remedy.
     """
     folder = Path(folder)
-    complete = completed(diagnosis)
-    report = json.dumps(complete.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    report = json.dumps(diagnosis.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     texts = {
-        MODEL_NAME: model_toml(complete, model, figure_data.noise),
+        MODEL_NAME: model_toml(diagnosis, model, figure_data.noise),
         HTML_NAME: render_page(diagnosis, figure_data),
         JSON_NAME: report,
     }
@@ -60,9 +57,9 @@ def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, mo
         # Files of an earlier report must not stand next to new ones.
         for name in (JSON_NAME, PICTURE_NAME, DECISIONS_NAME):
             (folder / name).unlink(missing_ok=True)
-    write_rrd(complete, figure_data, folder / RRD_NAME)
+    write_rrd(diagnosis, figure_data, folder / RRD_NAME)
     if figure_data.scores_by_step:
-        draw_picture(complete, figure_data, folder / PICTURE_NAME)
+        draw_picture(diagnosis, figure_data, folder / PICTURE_NAME)
     for name, content in texts.items():
         write_text(folder / name, content)
 
@@ -74,19 +71,6 @@ def write_decisions(figure_data: FigureData, folder: Path) -> Path:
     return path
 
 
-def completed(diagnosis: Diagnosis) -> Diagnosis:
-    """The diagnosis with default sentences and advice where it has none."""
-    sentence = diagnosis.sentence or text.verdict_sentence(diagnosis)
-    drive, why = next_drive(diagnosis)
-    command = drive_command(drive)
-    advice = diagnosis.advice or (f"{why} Drive it with: {command}" if command else why)
-    effects = tuple(
-        replace(e, sentence=e.sentence or text.effect_sentence(e.id, e.parameters, e.car_file_values))
-        for e in diagnosis.effects
-    )
-    return replace(diagnosis, sentence=sentence, effects=effects, advice=advice)
-
-
 def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoise | None) -> str:
     """The simulator as a car file with the noise of the recordings; comments state the origin of its numbers."""
     fitted = [use.path for use in diagnosis.recordings if use.role == "fit" and diagnosis.parameters]
@@ -95,7 +79,7 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoi
     lines = ["Car file written by carlab diagnose; use it with --car, or diagnose again from it."]
     lines.append(f"Verdict: {diagnosis.verdict}." + (f" Named effects: {found}." if found else " No named effects."))
     for effect in diagnosis.effects:
-        lines.append(effect.sentence or text.effect_sentence(effect.id, effect.parameters, effect.car_file_values))
+        lines.append(effect.sentence)
         if effect.indistinguishable_from:
             others = text.listed(list(effect.indistinguishable_from), "or")
             lines.append(f"These recordings do not distinguish {effect.id} from {others}.")

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.decisions import Alternatives, Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition, Decision, passes
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
@@ -171,9 +171,7 @@ def acceptance(problem: SearchProblem, candidate: Candidate) -> Alternatives:
 
 def is_accepted(problem: SearchProblem, candidate: Candidate) -> bool:
     """Whether the candidate is accepted as the next effect."""
-    if not candidate.is_tested:
-        return False
-    return any(all(c.holds for c in conditions) for conditions in acceptance(problem, candidate))
+    return candidate.is_tested and passes(acceptance(problem, candidate))
 
 
 def accepted(

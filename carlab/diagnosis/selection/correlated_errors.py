@@ -50,5 +50,5 @@ def decorrelating(problem: SearchProblem, model: Model) -> Scale:
     white = fitter.white(model.fit.config, (), np.zeros((1, 0)))[0]
     limit = problem.settings.selection.max_left_out_error
     errors = white.reshape(len(white), -1).clip(-limit, limit)
-    root = ErrorModel.of(errors, problem.settings.selection.error_ridge_share, problem.settings.comparison).root
+    root = ErrorModel.of(errors, problem.settings.selection.error_ridge_share).root
     return replace(model.scale, root=root)

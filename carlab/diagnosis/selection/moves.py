@@ -12,7 +12,7 @@ from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.gains import design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import fit_with_scale, refit_candidate, refit_without_each
-from carlab.diagnosis.selection.screening import Screen
+from carlab.diagnosis.selection.screening import Screen, screen_of
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     Returns:
         The model with the first such replacement, in the order of ``reduced``; None if there is none.
     """
-    settings, screening = problem.settings.selection, problem.settings.screening
+    settings = problem.settings.selection
     pairs = [
         (name, other)
         for name in reduced
@@ -59,15 +59,9 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     ]
     if not pairs or control.ends_search():
         return None
-    fitter, without_refits = problem.fitter(model.scale), problem.without_refits()
-    screens, min_scores = {}, {}
-    for name in dict(pairs):
-        config, fit = problem.config_with(reduced[name].effects), reduced[name].fit
-        screens[name] = Screen(fitter, config, fit, screening.max_windows, screening)
-        min_scores[name] = settings.swap_score_share * (fit.cost - model.fit.cost)
-    arguments = [
-        (without_refits, model, reduced[name], screens[name], other, min_scores[name]) for name, other in pairs
-    ]
+    without_refits = problem.without_refits()
+    screens = {name: screen_of(problem, reduced[name]) for name in dict(pairs)}
+    arguments = [(without_refits, model, reduced[name], screens[name], other) for name, other in pairs]
     swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
     for (name, _), swap in zip(pairs, swaps, strict=True):
         if swap is not None and swap[1] > settings.keep_chi2_min + _additional_chi2(problem, swap[0].effect, name):
@@ -85,14 +79,14 @@ def _additional_chi2(problem: SearchProblem, new: str, old: str) -> float:
 
 
 def _fitted_swap(
-    problem: SearchProblem, model: Model, reduced: Model, screen: Screen, other: str, min_score: float
+    problem: SearchProblem, model: Model, reduced: Model, screen: Screen, other: str
 ) -> tuple[Candidate, float] | None:
     """Fit ``other`` in addition to ``reduced``, with the chi2 by which it is better than ``model``.
 
-    None if its screening score is below ``min_score``.
+    None if its screening score is too small a share of the gain of the effect that ``reduced`` lacks.
     """
     screened = screen.score(other, effect_parameters(other, problem.nominal))
-    if screened.score < min_score:
+    if screened.score < problem.settings.selection.swap_score_share * (reduced.fit.cost - model.fit.cost):
         return None
     candidate = refit_candidate(problem, reduced, screened)
     design_effect = design_effect_of(problem.fitter(model.scale).with_covariance(candidate.fit), other)

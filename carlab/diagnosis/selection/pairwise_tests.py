@@ -21,7 +21,7 @@ from carlab.diagnosis.selection.delay_groups import confusable_shared_delays
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
-from carlab.diagnosis.selection.screening import Screen
+from carlab.diagnosis.selection.screening import screen_of
 
 log = logging.getLogger(__name__)
 
@@ -118,11 +118,9 @@ def _fitted_alternative(
     problem: SearchProblem, model: Model, without: Fit, name: str, other: str
 ) -> tuple[Candidate, FloatArray] | None:
     """Fit ``other`` in place of ``name``, with its loss on left-out blocks (S,); None if it explains too little."""
-    screening = problem.settings.screening
     reduced = Model(tuple(e for e in model.effects if e != name), without, model.scale)
-    fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
-    screen = Screen(fitter, config, without, screening.max_windows, screening)
-    candidate = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
+    screened = screen_of(problem, reduced).score(other, effect_parameters(other, problem.nominal))
+    candidate = refit_candidate(problem, reduced, screened)
     if candidate.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
         return None
     return candidate, left_out_loss(problem, candidate.fit, model.scale)
@@ -142,5 +140,4 @@ def left_out_loss(
         problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds(), linearisation),
         problem.measured_std,
         max_error=problem.settings.selection.max_left_out_error,
-        settings=problem.settings.identification,
     )

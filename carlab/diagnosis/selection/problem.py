@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.decisions import Alternatives, Decision, passes
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
@@ -19,8 +19,10 @@ from carlab.diagnosis.identification.fit_parameters import (
     tyre_effects,
     with_effect,
 )
-from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
+from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION, DiagnosisSettings
 from carlab.jobs.function_workers import FunctionWorkers
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS, EffectParameter
@@ -54,13 +56,18 @@ class SearchProblem:
 
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
         """Free parameters of a fit with ``effects``."""
-        base = base_parameters(self.nominal, self.settings.identification, uses_std=True)
+        base = base_parameters(self.nominal, uses_std=True)
         fitted = (*tyre_effects(self.nominal), *effects)
         return (*base, *(f for name in fitted for f in effect_parameters(name, self.nominal)))
 
     def fitter(self, scale: Scale) -> Fitter:
         """A fitter for the windows with an error scale."""
-        return Fitter(self.windows, scale, self.settings.identification)
+        return Fitter(self.windows, scale)
+
+    def scale_of(self, config: SimulatorConfig, values: Mapping[str, FloatArray] | None = None) -> Scale:
+        """Scale of the errors of a simulator on the windows, with other ``values`` (1,) by dotted name."""
+        predicted = simulate_windows(self.windows, config, values)
+        return Scale.of(prediction_errors(predicted, self.windows)[0], self.floor)
 
     def config_with(self, effects: Sequence[str]) -> SimulatorConfig:
         """The simulator with ``effects`` added, at the values of the car file or else at their identity values.
@@ -93,7 +100,7 @@ class SearchProblem:
 
     def perfect_loss(self) -> float:
         """Expected loss of a perfect simulator: one half for each whitened error."""
-        return 0.5 * len(self.windows) * 6 * self.settings.identification.loss_steps
+        return 0.5 * len(self.windows) * 6 * IDENTIFICATION.loss_steps
 
     def required_chi2(self, effect: str) -> float:
         """Minimum chi2 of an effect; it grows with the number of parameters and for an infinite identity value."""
@@ -196,6 +203,13 @@ class RunControl:
     omit: Callable[[str], None] = lambda stage: None
     ends_search: Callable[[], bool] = lambda: False
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
+
+    def effects_stand(self, effects: Sequence[str], alternatives: Alternatives, count: int) -> bool:
+        """Whether accepted effects, of ``count``, stand together; records the decision about each of them."""
+        stand = passes(alternatives)
+        for name in effects:
+            self.record(Decision("stand", name, alternatives, stand, count))
+        return stand
 
 
 def numbers_of(effect: str) -> list[EffectParameter]:

@@ -13,8 +13,6 @@ from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, values_at
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
 from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -58,7 +56,7 @@ def refit_without_each(
 
 def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> FloatArray:
     """Coordinates of a fit with ``effects`` at the values of ``initial``; 0 without a value."""
-    known = {f.name: float(z) for f, z in zip(initial.free, initial.z, strict=True)}
+    known = initial.coordinates()
     return np.array([known.get(f.name, 0.0) for f in problem.free_parameters(effects)])
 
 
@@ -98,7 +96,7 @@ def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningRes
     starts = [np.concatenate([before, s]) for s in _distinct_starts(free[len(before) :], screened.starts)]
     if len(starts) > 1:
         settings = problem.settings.selection
-        few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
+        few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale)
         tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
         starts = [min(tries, key=lambda f: f.cost).z]
     fit = fitter.fit(config, free, starts[0], iterations=iterations)
@@ -143,22 +141,12 @@ def fit_with_scale(
         free: n parameters to fit.
         start: their coordinates (n,) at the start.
     """
-    settings, identification = problem.settings.selection, problem.settings.identification
-    windows, floor = problem.windows, problem.floor
-    scale = Scale.of(
-        prediction_errors(simulate_windows(windows, config, values_at(free, start)), windows)[0],
-        floor,
-        settings=identification,
-    )
+    settings = problem.settings.selection
+    scale = problem.scale_of(config, values_at(free, start))
     for _ in range(settings.scale_iterations):
         fit = problem.fitter(scale).fit(config, free, start)
         start = fit.z
-        before, scale = (
-            scale,
-            Scale.of(
-                prediction_errors(simulate_windows(windows, fit.config), windows)[0], floor, settings=identification
-            ),
-        )
+        before, scale = scale, problem.scale_of(fit.config)
         if np.abs(scale.sigma / before.sigma - 1.0).max() < settings.scale_change_max:
             return Model(effects, fit, before)
     return Model(effects, problem.fitter(scale).fit(config, free, start), scale)

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.bounded_step import coordinate_bounds
+from carlab.diagnosis.identification.error_scale import huber_weight
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
-from carlab.diagnosis.settings import DEFAULT, ScreeningSettings
+from carlab.diagnosis.settings import SCREENING, ScreeningSettings
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 
@@ -54,11 +55,11 @@ class Screen:
         config: SimulatorConfig,
         best: Fit,
         max_windows: int | None = None,
-        settings: ScreeningSettings = DEFAULT.screening,
+        settings: ScreeningSettings = SCREENING,
     ) -> None:
         count = len(fitter.windows)
         if max_windows is not None:
-            fitter = Fitter(fitter.windows.thinned(max_windows), fitter.scale, fitter.settings)
+            fitter = Fitter(fitter.windows.thinned(max_windows), fitter.scale)
         self.settings = settings
         self.share = len(fitter.windows) / count
         self.fitter = fitter
@@ -66,7 +67,7 @@ class Screen:
         self.best = best
         slopes, white = fitter.linearised(best)
         self.white = white.reshape(-1)
-        self.weight = np.sqrt(np.minimum(1.0, fitter.settings.huber_delta / np.maximum(np.abs(self.white), 1e-12)))
+        self.weight = np.sqrt(huber_weight(self.white))
         jacobian = (slopes.reshape(len(best.free), len(self.white)) * self.weight).T
         prior = np.diag([1.0 / f.prior_z for f in best.free])
         basis, _ = np.linalg.qr(np.vstack([jacobian, prior]))
@@ -224,12 +225,16 @@ class _Probe:
         return [{name: float(f.value(np.array(z))) for (name, f), z in zip(pairs, p, strict=True)} for p in sized]
 
 
+def screen_of(problem: SearchProblem, model: Model) -> Screen:
+    """The screen of candidates that are added to a model."""
+    config = problem.config_with(model.effects)
+    return Screen(problem.fitter(model.scale), config, model.fit, SCREENING.max_windows)
+
+
 def screen_candidates(
     problem: SearchProblem, model: Model, names: Sequence[str], control: RunControl
 ) -> tuple[ScreeningResult, ...]:
     """Screening scores of effects added to a model, the highest first."""
-    settings = problem.settings.screening
-    fitter = problem.fitter(model.scale)
-    screen = Screen(fitter, problem.config_with(model.effects), model.fit, settings.max_windows, settings)
+    screen = screen_of(problem, model)
     scored = control.workers.map(screen.score, [(name, effect_parameters(name, problem.nominal)) for name in names])
     return tuple(sorted((each for each in scored if each is not None), key=lambda result: -result.score))

@@ -104,7 +104,7 @@ def _merges(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
 def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict[str, float]) -> _Replacement | None:
     """Fit ``new`` effects in place of ``old`` ones; None if the fit is significantly worse, or not as required."""
     effects = (*(e for e in model.effects if e not in old), *new)
-    known = {f.name: float(z) for f, z in zip(model.fit.free, model.fit.z, strict=True)}
+    known = model.fit.coordinates()
     lags = {f"effects.{e}.{EFFECTS[e].lag_parameter}": lag for e, lag in new.items()}
     free = problem.free_parameters(effects)
     start = np.array([

@@ -21,40 +21,42 @@ from carlab.diagnosis.settings.selection import RivalSettings, ScreeningSettings
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisSettings:
-    """All settings of a diagnosis, by stage."""
+    """Settings that a single diagnosis may change, by stage."""
 
     windows: WindowSettings = field(default_factory=WindowSettings)
-    events: EventSettings = field(default_factory=EventSettings)
-    identification: IdentificationSettings = field(default_factory=IdentificationSettings)
     curves: CurveSettings = field(default_factory=CurveSettings)
-    screening: ScreeningSettings = field(default_factory=ScreeningSettings)
     selection: SelectionSettings = field(default_factory=SelectionSettings)
     rivals: RivalSettings = field(default_factory=RivalSettings)
-    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-    unexplained: UnexplainedSettings = field(default_factory=UnexplainedSettings)
-    quick: QuickSettings = field(default_factory=QuickSettings)
-    comparison: ComparisonSettings = field(default_factory=ComparisonSettings)
-    drift: DriftSettings = field(default_factory=DriftSettings)
-    report: ReportSettings = field(default_factory=ReportSettings)
 
 
 DEFAULT = DiagnosisSettings()
 """The settings of ``carlab diagnose`` and of the proof."""
 
+COMPARISON = ComparisonSettings()
+DRIFT = DriftSettings()
+EVENTS = EventSettings()
+EVIDENCE = EvidenceSettings()
+IDENTIFICATION = IdentificationSettings()
+QUICK = QuickSettings()
+REPORT = ReportSettings()
+SCREENING = ScreeningSettings()
+UNEXPLAINED = UnexplainedSettings()
+"""Settings that are the same in every diagnosis, check and comparison."""
+
 __all__ = [
+    "COMPARISON",
     "DEFAULT",
-    "ComparisonSettings",
+    "DRIFT",
+    "EVENTS",
+    "EVIDENCE",
+    "IDENTIFICATION",
+    "QUICK",
+    "REPORT",
+    "SCREENING",
+    "UNEXPLAINED",
     "CurveSettings",
     "DiagnosisSettings",
-    "DriftSettings",
-    "EventSettings",
-    "EvidenceSettings",
-    "IdentificationSettings",
-    "QuickSettings",
-    "ReportSettings",
-    "RivalSettings",
     "ScreeningSettings",
     "SelectionSettings",
-    "UnexplainedSettings",
     "WindowSettings",
 ]

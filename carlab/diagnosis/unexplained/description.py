@@ -17,7 +17,7 @@ from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
+from carlab.diagnosis.settings import UNEXPLAINED
 from carlab.diagnosis.unexplained.residual_terms import TERMS, Term, responses
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
@@ -91,7 +91,6 @@ def fit_residual_terms(
     fit: Fit,
     scale: Scale,
     term_chi2_min: float | None = None,
-    settings: UnexplainedSettings = DEFAULT.unexplained,
 ) -> ResidualModel:
     """Forward selection of unnamed terms in addition to ``fit``.
 
@@ -100,16 +99,15 @@ def fit_residual_terms(
         fit: fit with the accepted effects.
         scale: error scale.
         term_chi2_min: minimum chi2 of a term; by default that of the settings.
-        settings: settings of the selection.
     """
     fitter = Fitter(windows, scale)
     screen = Screen(fitter, fit.config, fit)
     design_effect = fitter.with_covariance(fit).design_effect
-    library = _library(windows, fit, scale, screen, settings)
+    library = _library(windows, fit, scale, screen)
     if library is None:
         return ResidualModel(())
-    min_gain = settings.term_chi2_min if term_chi2_min is None else term_chi2_min
-    picked, gains = _select(library, screen.residual, min_gain, design_effect, settings)
+    min_gain = UNEXPLAINED.term_chi2_min if term_chi2_min is None else term_chi2_min
+    picked, gains = _select(library, screen.residual, min_gain, design_effect)
     if not picked:
         return ResidualModel(())
     columns, labels = library.columns, library.labels
@@ -123,11 +121,9 @@ def fit_residual_terms(
     return ResidualModel(chosen, np.mean(before**2 - (before + change) ** 2, axis=0) * scale.sigma[-1] ** 2)
 
 
-def _library(
-    windows: PredictionWindows, fit: Fit, scale: Scale, screen: Screen, settings: UnexplainedSettings
-) -> _Library | None:
+def _library(windows: PredictionWindows, fit: Fit, scale: Scale, screen: Screen) -> _Library | None:
     """Columns of all terms that change the errors, or None."""
-    response = responses(windows, fit.config, scale, settings)
+    response = responses(windows, fit.config, scale)
     yaw_per_side = _yaw_per_side_acceleration(fit.config)
     columns, labels = [], []
     for term in TERMS:
@@ -141,21 +137,21 @@ def _library(
 
 
 def _select(
-    library: _Library, residual: FloatArray, chi2_min: float, design_effect: float, settings: UnexplainedSettings
+    library: _Library, residual: FloatArray, chi2_min: float, design_effect: float
 ) -> tuple[list[int], list[float]]:
     """Indices of the columns chosen by orthogonal matching pursuit, and their gains."""
     design, labels = library.columns, library.labels
     picked: list[int] = []
     gains: list[float] = []
     basis = np.zeros((0, design.shape[1]))
-    for _ in range(settings.max_terms):
+    for _ in range(UNEXPLAINED.max_terms):
         projected = design - (design @ basis.T) @ basis
         length = np.linalg.norm(projected, axis=1)
         score = np.where(length > 0.1, 0.5 * (projected @ residual / np.maximum(length, 0.1)) ** 2, 0.0)
         best = float(score.max())
-        if 2.0 * best / design_effect < chi2_min or (gains and best < settings.next_term_share * gains[0]):
+        if 2.0 * best / design_effect < chi2_min or (gains and best < UNEXPLAINED.next_term_share * gains[0]):
             break
-        nearly_best = np.flatnonzero(score > settings.simplest_gain_share * best)
+        nearly_best = np.flatnonzero(score > UNEXPLAINED.simplest_gain_share * best)
         k = int(min(nearly_best, key=lambda i: (len(labels[i][0].inputs), i)))
         axis = projected[k] / length[k]
         basis = np.vstack([basis, axis])
@@ -226,24 +222,21 @@ REGIMES: tuple[tuple[str, str, Callable[[dict[str, FloatArray]], FloatArray]], .
 )
 
 
-def worst_regime(
-    features: dict[str, FloatArray], window_errors: FloatArray, settings: UnexplainedSettings = DEFAULT.unexplained
-) -> str:
+def worst_regime(features: dict[str, FloatArray], window_errors: FloatArray) -> str:
     """The feature whose upper third has the largest errors, as a rule such as ``speed > 2 m/s``.
 
     Args:
         features: from ``start_features``, each (S,).
         window_errors: error of each window (S,).
-        settings: settings of the regimes.
     """
     best, text = 1.0, "everywhere alike"
     for name, unit, value in REGIMES:
         feature = value(features)
-        limit = float(np.quantile(feature, settings.regime_quantile))
+        limit = float(np.quantile(feature, UNEXPLAINED.regime_quantile))
         high, low = window_errors[feature > limit], window_errors[feature <= limit]
-        if min(len(high), len(low)) < settings.regime_windows_min:
+        if min(len(high), len(low)) < UNEXPLAINED.regime_windows_min:
             continue
         ratio = float(np.sqrt(np.mean(high**2)) / (np.sqrt(np.mean(low**2)) + 1e-9))
-        if ratio > max(best, settings.regime_ratio_min):
+        if ratio > max(best, UNEXPLAINED.regime_ratio_min):
             best, text = ratio, f"{name} > {limit:.2g} {unit}".strip()
     return text

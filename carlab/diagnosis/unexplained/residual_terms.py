@@ -15,7 +15,7 @@ import numpy as np
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
+from carlab.diagnosis.settings import UNEXPLAINED
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
@@ -159,12 +159,11 @@ def responses(
     windows: PredictionWindows,
     config: SimulatorConfig,
     scale: Scale,
-    settings: UnexplainedSettings = DEFAULT.unexplained,
 ) -> Responses:
     """Impulse responses of ``config`` along its predictions of windows, at the middle of each time span."""
     predicted = simulate_windows(windows, config)[0]
-    impulses = settings.impulse_sizes
-    every = max(windows.steps // settings.impulses, 1)
+    impulses = UNEXPLAINED.impulse_sizes
+    every = max(windows.steps // UNEXPLAINED.impulses, 1)
     begins = np.arange(every // 2, windows.steps, every)
     yaw = windows.initial_states[:, 2, None]
     matrix = np.zeros((3, len(begins), len(windows), len(scale.steps), 6))

@@ -17,7 +17,7 @@ from scipy.stats import gamma
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.core.robust import STD_OVER_MAD
-from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
+from carlab.diagnosis.settings import UNEXPLAINED
 from carlab.prediction.windows import RecordingSegment
 
 PERIODS_PER_M = np.arange(1.0, 12.0, 0.05)
@@ -56,24 +56,24 @@ class Vibration:
         return f"{STATE_NAMES[k]} += {self.amplitude[k]:.2g} sin(2 pi s / {1.0 / self.periods_per_m:.3g} m)"
 
 
-def find_vibration(
-    segments: Sequence[RecordingSegment], settings: UnexplainedSettings = DEFAULT.unexplained
-) -> Vibration | None:
+def find_vibration(segments: Sequence[RecordingSegment]) -> Vibration | None:
     """The strongest significant line in yaw, vx, vy or yaw rate, or None."""
     power, strength, by_time = (np.zeros((6, n)) for n in (len(PERIODS_PER_M), len(PERIODS_PER_M), len(FREQUENCIES_HZ)))
     blocks = 0
     for segment in segments:
         spread = STD_OVER_MAD * np.median(np.abs(segment.residual), axis=0)
-        residual = np.clip(segment.residual, -settings.vibration_max_z * spread, settings.vibration_max_z * spread)
+        residual = np.clip(
+            segment.residual, -UNEXPLAINED.vibration_max_z * spread, UNEXPLAINED.vibration_max_z * spread
+        )
         distance_m = np.cumsum(segment.speed) * segment.sampled_s
-        length = max(round(settings.vibration_block_s / segment.sampled_s), 2)
+        length = max(round(UNEXPLAINED.vibration_block_s / segment.sampled_s), 2)
         in_time = _lines(
             np.where(0.5 / segment.sampled_s > FREQUENCIES_HZ, FREQUENCIES_HZ, 0.0),
             segment.sampled_s * np.arange(float(length)),
         )
         for first in range(0, len(distance_m) - length + 1, length):
             block = slice(first, first + length)
-            if segment.speed[block].mean() < settings.vibration_speed_min_mps:
+            if segment.speed[block].mean() < UNEXPLAINED.vibration_speed_min_mps:
                 continue
             weighted = residual[block] * segment.speed[block, None]
             energy = np.maximum(np.sum(weighted**2, axis=0), 1e-30)[:, None]
@@ -87,13 +87,13 @@ def find_vibration(
     channel = 2 + int(np.argmax(power[2:].max(axis=1)))
     line = int(np.argmax(power[channel]))
     highest = float(power[channel, line])
-    if highest < settings.vibration_ratio_min * blocks or highest < by_time[channel].max():
+    if highest < UNEXPLAINED.vibration_ratio_min * blocks or highest < by_time[channel].max():
         return None
-    if gamma.sf(highest, blocks) > settings.vibration_p_max:
+    if gamma.sf(highest, blocks) > UNEXPLAINED.vibration_p_max:
         return None
     median_mps = float(np.median(np.concatenate([segment.speed for segment in segments])))
     amplitude = 2.0 * np.sqrt(strength[:, line] / blocks) * median_mps
-    return Vibration(float(PERIODS_PER_M[line]), amplitude, power[:, line] / blocks, settings.vibration_ratio_min)
+    return Vibration(float(PERIODS_PER_M[line]), amplitude, power[:, line] / blocks, UNEXPLAINED.vibration_ratio_min)
 
 
 def _lines(frequencies: FloatArray, at: FloatArray) -> NDArray[np.complex128]:

@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver, resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -174,6 +174,7 @@ def _call(
 ) -> None:
     import torch
 
+    threading.Thread(target=_end_with_parent, name="end with the parent", daemon=True).start()
     torch.set_num_threads(1)
     if reports:
         arguments = (*arguments, lambda *what: pipe.send(("report", what)))
@@ -188,3 +189,11 @@ def _call(
         pipe.send(("crashed", f"{type(error).__name__}: {error}"))
     finally:
         pipe.close()
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as its parent has ended, also by SIGKILL: nothing else reads its result."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
