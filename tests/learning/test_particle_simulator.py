@@ -119,7 +119,7 @@ def test_particles_are_the_simulator_and_the_discrepancy_of_their_draws(
     alone = particles.simulated(normal).mean(dim=0)
     assert float((alone - outputs)[:, 3].abs().mean()) > 0.5 * EXTRA_MPS
     assert float((predicted - outputs)[:, 3].abs().mean()) < 0.3 * EXTRA_MPS
-    mean = posterior.predict(inputs)[0]
+    mean = posterior.predict(inputs).mean
     assert float((predicted - mean)[:, 3].square().mean().sqrt()) < 0.2 * EXTRA_MPS
     assert {tuple(draw.tolist()) for draw in particles.simulator.parameters} <= {
         tuple(draw.tolist()) for draw in posterior.parameters
