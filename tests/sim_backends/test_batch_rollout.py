@@ -73,17 +73,7 @@ def test_float32_stays_close_to_float64():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    "effects",
-    [
-        {},
-        {
-            "steering_lag": {"time_constant": 0.07},
-            "motor_lag": {"time_constant": 0.2},
-            "steering_delay": {"delay": 0.021},
-        },
-    ],
-)
+@pytest.mark.parametrize("effects", [{}, LAGS])
 def test_agrees_with_the_single_car_path_with_history(kind, effects):
     config = SimulatorConfig(kind=kind, effects=effects)
     start, commands = some(3, 20, seed=4)
