@@ -30,9 +30,10 @@ from carlab.studies.regression.methods import FitTask
 from carlab.studies.regression.recordings import RecordedCase
 from carlab.studies.regression.study import Progress
 from learning.evaluation import negative_log_likelihood
+from learning.rollouts import RolloutModel
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
-from learning.world.disturbance import DisturbedCar, RolloutModel
+from learning.world.disturbance import DisturbedCar
 from learning.world.disturbance_fit import MAX_WINDOWS, RolloutErrors, fit_disturbance, pooled, rollout_errors
 from learning.world.rollout_fit import fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
