@@ -19,18 +19,11 @@ from learning.posterior.distillation import MAX_NEIGHBOUR_DISTANCE, Distillation
 from learning.posterior.inference import infer
 from learning.priors.domain_models import Pendulum, uniform
 from learning.stein import moment_direction
+from tests.helpers.seeded import generator, normal
 
 UNITS = Normaliser(torch.tensor([0.5]), torch.tensor([1.5]), torch.tensor([1.0]), torch.tensor([2.0]))
 NOISE = torch.tensor([0.2])
 EMPTY = torch.zeros(0, 1)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize(("steps", "count"), [(3000, 8192), (40, 40 * 16 * 4), (1, 1024)])

@@ -24,6 +24,7 @@ from learning.priors.simulator_model import CarModel
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import NOISE_STD, car_units, load_car, load_car_arrays, save_car, save_car_arrays
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.seeded import generator
 
 HISTORY, PARTICLES = 2, 6
 GAIN = "motor.drive_gain"
@@ -31,10 +32,6 @@ CAR = SimulatorConfig(kind="kinematic")
 MODEL = CarModel(CAR, HISTORY, {GAIN: (4.0, 12.0), "motor.damping": (1.0, 3.0)}, velocity_delay_s=0.01)
 EXTRA_MPS = 0.05
 """Change of vx in a step that the simulator lacks."""
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def rows(count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
