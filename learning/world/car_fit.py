@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import struct
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, first_line
 from carlab.core.observation import STATE_FEATURES
 from learning.functional_svgd.authors_fsvgd import WorldDynamics
-from learning.networks.array_file import MAX_BYTES, TOO_LARGE, check_archive, read_arrays, whole_number, write_arrays
+from learning.networks.array_file import (
+    MAX_BYTES,
+    TOO_LARGE,
+    UNREADABLE,
+    check_archive,
+    read_arrays,
+    whole_number,
+    write_arrays,
+)
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
@@ -58,6 +64,7 @@ _SIMULATOR_KEY, _DRAWS_KEY = "simulator", "simulator_parameters"
 _OPTIONAL_KEYS = (_DECORRELATION_KEY, "trend", "correlation", _INPUT_CLIP_KEY)
 _FRAMES = ("body", "world")
 _ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
+_READ_ERRORS = (*UNREADABLE, AttributeError, AssertionError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +266,7 @@ def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, A
     except pickle.UnpicklingError as error:  # its own message recommends to read the file unsafely
         raise DataError(f"{path} holds more than numbers, so it is no learned car; {remedy}.") from error
     except _READ_ERRORS as error:
-        raise DataError(f"The learned car in {path} cannot be read ({_first_line(error)}); {remedy}.") from error
+        raise DataError(f"The learned car in {path} cannot be read ({first_line(error)}); {remedy}.") from error
     known = f"{FILE_VERSION} and {SIMULATOR_FILE_VERSION}"
     raise DataError(f"{path} has version {version}, this program reads versions {known}; {remedy}.")
 
@@ -345,14 +352,3 @@ def _check_finite(parts: Mapping[str, Tensor]) -> None:
     for name, part in parts.items():
         if not torch.isfinite(part).all():
             raise ValueError(f"{name} is not finite")
-
-
-_READ_ERRORS = (
-    *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError),
-    *(ArithmeticError, MemoryError, struct.error, pickle.UnpicklingError, zipfile.BadZipFile),
-)
-
-
-def _first_line(error: BaseException) -> str:
-    """The first line of an error's message, or its type."""
-    return next(iter(str(error).splitlines()), "") or type(error).__name__
