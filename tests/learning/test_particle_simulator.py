@@ -206,6 +206,15 @@ def test_file_with_a_damaged_simulator_is_refused(
         load_car_arrays(path)
 
 
+def test_draws_in_fewer_stored_numbers_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "car.pt"
+    save_car(CarDynamics(random_particles(), HISTORY), path)
+    content = torch.load(path, weights_only=True)
+    torch.save(content | {"simulator_parameters": torch.zeros(1).expand_as(content["simulator_parameters"])}, path)
+    with pytest.raises(DataError, match="simulator_parameters has fewer numbers than its shape"):
+        load_car(path)
+
+
 def test_file_of_networks_alone_has_the_earlier_version(tmp_path: Path) -> None:
     """Earlier programs read it; they refuse a file with a simulator, whose networks alone would be a wrong car."""
     for particles, version in ((random_particles(), 7), (replace(random_particles(), simulator=None), 6)):
