@@ -21,10 +21,10 @@ from carlab.core.resource import Resource
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.links.lines import BITS_PER_BYTE
 from drivers.vesc.serial_codec import VescFrameDecoder, encode_frame
 
 POLL_S = 0.005
-BITS_PER_BYTE = 10
 
 
 class SerialFirmware(Resource):
