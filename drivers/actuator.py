@@ -15,7 +15,7 @@ from carlab.core.quantities import NEUTRAL, Action, Health
 from carlab.core.resource import Resource
 from drivers.calibration import ActuatorCalibration, DeviceCommand
 from drivers.config import ActuatorConfig
-from drivers.sender.logic import Order, Request, SenderState
+from drivers.sender.logic import SAFETY_STOP, Order, Request, SenderState
 from drivers.sender.process import Sender, start_sender
 from drivers.sender.status import SenderStatus
 from drivers.sender.timeout_measurement import ADVISED_TIMEOUT_S, MAX_TIMEOUT_S
@@ -28,7 +28,6 @@ SILENT_SENDER_S = 0.5
 POLL_S = 0.001
 RESUME_POLLS = 100
 """Polls after a silence, before the sender counts as hanging: after a pause of the computer it resumes too."""
-SAFETY_STOP = "The car was stopped for safety; check the car, then reset the fault and arm again."
 
 
 class Actuator(Resource):

@@ -142,6 +142,14 @@ class Prediction(Protocol):
         ...
 
 
+class Predictor(Protocol):
+    """A fitted model."""
+
+    def predict(self, inputs: Tensor) -> Prediction:
+        """Prediction at raw inputs (N, D), in raw units."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class WeightedMixture:
     """Weighted average of the predictions of several models; weights (K,) sum to 1."""

@@ -147,10 +147,17 @@ def decorrelation_of(correlation: Tensor, error_std: Tensor) -> Tensor:
     return error_std[:, None] * decorrelation / error_std
 
 
+def most_likely_dof(log_likelihood: Callable[[float], float]) -> float:
+    """Degrees of freedom among ``DOF_CANDIDATES`` by their log-likelihood; more have to gain ``DOF_MIN_GAIN_NATS``."""
+    best, dof = -math.inf, math.inf
+    for candidate in DOF_CANDIDATES:
+        if (found := log_likelihood(candidate)) > best + DOF_MIN_GAIN_NATS:
+            best, dof = found, candidate
+    return dof
+
+
 def student_weights(square: Tensor, outputs: int) -> tuple[float, Tensor]:
     """Fit the degrees of freedom of a Student-t distribution of unit scale, and weight its rows.
-
-    More degrees of freedom replace fewer only if the log-likelihood is higher by ``DOF_MIN_GAIN_NATS``.
 
     Args:
         square: squared Mahalanobis distances (n,).
@@ -159,11 +166,7 @@ def student_weights(square: Tensor, outputs: int) -> tuple[float, Tensor]:
     Returns:
         Degrees of freedom, and the weight of each row (n,), at most 1.
     """
-    best, dof = -math.inf, math.inf
-    for candidate in DOF_CANDIDATES:
-        log_likelihood = float(log_student(square, outputs, candidate).sum())
-        if log_likelihood > best + DOF_MIN_GAIN_NATS:
-            best, dof = log_likelihood, candidate
+    dof = most_likely_dof(lambda candidate: float(log_student(square, outputs, candidate).sum()))
     if math.isinf(dof):
         return dof, torch.ones_like(square)
     return dof, ((dof + outputs) / (dof + square)).clamp_max(1.0)

@@ -65,7 +65,7 @@ class NatNetClient(Resource):
         self._changed = threading.Condition()
         self._statistics = StreamStatistics()
         self._decoder: BitstreamSwitch | None = None
-        self._responses: list[messages.Response | None] = []
+        self._responses: list[int | None] = []
         self._polls_mode = self._is_recording = False
         self._server = ""
         self._command: socket.socket | None = None
@@ -140,8 +140,7 @@ class NatNetClient(Resource):
             decoder.pending = wanted
             request = messages.encode_request(f"Bitstream,{wanted}")
             answered = self._send_until(MessageId.REQUEST, request, lambda: bool(self._responses))
-            response = self._responses[0] if answered else None
-            if response is not None and len(response.data) == 4 and response.as_int() == 0:
+            if answered and self._responses[0] == 0:
                 return
             decoder.pending = None
         try:
@@ -302,7 +301,8 @@ class NatNetClient(Resource):
                 models = self.models = self._decoder.decode_models(payload)
                 self._schedule.models_outdated = False
             elif message_id in (MessageId.RESPONSE, MessageId.UNRECOGNIZED_REQUEST):
-                self._handle_response(messages.Response(payload) if message_id == MessageId.RESPONSE else None)
+                is_answer = message_id == MessageId.RESPONSE
+                self._handle_response(messages.decode_integer_response(payload) if is_answer else None)
             elif message_id == MessageId.MESSAGESTRING:
                 _log.info("Message from the NatNet server: %s", messages.decode_text(payload))
             self._changed.notify_all()
@@ -328,12 +328,12 @@ class NatNetClient(Resource):
             self.alignment = ClockAlignment(float(info.clock_hz))
         return before is not None
 
-    def _handle_response(self, response: messages.Response | None) -> None:
+    def _handle_response(self, response: int | None) -> None:
         """Store the answer to the request for the mode, or to that for a bitstream version before."""
         if not self._polls_mode:
             self._responses.append(response)
-        elif response is not None and len(response.data) == 4:
-            self.server_mode = response.as_int()
+        elif response is not None:
+            self.server_mode = response
 
     def _wants_other_bitstream(self, info: messages.ServerInfo) -> bool:
         return (

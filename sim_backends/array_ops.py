@@ -47,7 +47,21 @@ class Ops(Protocol):
         """``c - a * b``."""
 
 
-class FloatOps:
+class _Products:
+    """Products with a sum, by Python's operators."""
+
+    @staticmethod
+    def fma(a: Value, b: Value, c: Value) -> Value:
+        """``a * b + c``."""
+        return a * b + c
+
+    @staticmethod
+    def fms(a: Value, b: Value, c: Value) -> Value:
+        """``c - a * b``."""
+        return c - a * b
+
+
+class FloatOps(_Products):
     """Python floats and ``math``: one car. All shapes are ()."""
 
     sin = staticmethod(math.sin)
@@ -86,18 +100,8 @@ class FloatOps:
         """``yes`` where the condition holds, otherwise ``no``."""
         return yes if condition else no
 
-    @staticmethod
-    def fma(a: Value, b: Value, c: Value) -> Value:
-        """``a * b + c``."""
-        return a * b + c
 
-    @staticmethod
-    def fms(a: Value, b: Value, c: Value) -> Value:
-        """``c - a * b``."""
-        return c - a * b
-
-
-class NumpyOps:
+class NumpyOps(_Products):
     """NumPy arrays: a batch of cars without torch."""
 
     sin = staticmethod(np.sin)
@@ -123,16 +127,6 @@ class NumpyOps:
     def clip(x: Value, low: Value, high: Value) -> Value:
         """Between ``low`` and ``high``; faster than ``numpy.clip``."""
         return np.minimum(np.maximum(x, low), high)
-
-    @staticmethod
-    def fma(a: Value, b: Value, c: Value) -> Value:
-        """``a * b + c``."""
-        return a * b + c
-
-    @staticmethod
-    def fms(a: Value, b: Value, c: Value) -> Value:
-        """``c - a * b``."""
-        return c - a * b
 
 
 FLOATS: Ops = FloatOps()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -29,15 +30,15 @@ def _best_s(function: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-class SingleTorchThread:
+@contextmanager
+def single_torch_thread() -> Iterator[None]:
     """Context in which torch uses one thread."""
-
-    def __enter__(self) -> None:
-        self._before = torch.get_num_threads()
-        torch.set_num_threads(1)
-
-    def __exit__(self, *exc_info: object) -> None:
-        torch.set_num_threads(self._before)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _drive(cars: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
@@ -67,7 +68,7 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
     """
     config = SimulatorConfig()
     found: dict[str, float] = {}
-    with SingleTorchThread():
+    with single_torch_thread():
         for count in (1, cars):
             start, commands = _drive(count)
             rollout(config, start, commands)
@@ -117,7 +118,7 @@ def gradient_speed(cars: int = 2048, repeats: int = 3, batch: int = 4096) -> dic
     names = [n for n in config.values() if n.split(".")[0] in ("vehicle", "tyre", "motor", "steering")]
     numbers = 6 + 2 * TICKS + len(names)
     found: dict[str, float] = {"numbers": float(numbers), "cars": float(cars)}
-    with SingleTorchThread():
+    with single_torch_thread():
         for label, count in (("", cars), ("one_car_", 1)):
             by_gradient = _best_s(lambda count=count: _gradient(config, names, count), repeats + 1)  # type: ignore[misc]
             size = min(batch, 2 * numbers * count)

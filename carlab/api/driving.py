@@ -156,7 +156,8 @@ def replay(
 
     above_zero(seconds=seconds)
     valid_seed(seed=seed)
-    choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
+    # Only ``drive`` checks and warns.
+    choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed, is_driven=False)
     if isinstance(recording, EpisodeData):
         episode = recording
     else:

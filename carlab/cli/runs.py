@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +24,10 @@ from carlab.experiment.episodes.interrupts import Interrupts
 
 
 def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:
-    """Create a prompt to place the car at a start pose. ^C at the prompt ends the run like ^C while driving."""
+    """Create a prompt to place the car at a start pose. ^C at the prompt ends the run like ^C while driving.
+
+    Only a line that is typed after the prompt confirms: the car moves then.
+    """
 
     def ask(start: CarState) -> None:
         text = f"Put the car at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad"
@@ -32,12 +37,15 @@ def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:
         handler = signal.signal(signal.SIGINT, signal.default_int_handler)
         interrupted = False
         try:
+            with contextlib.suppress(termios.error):  # the terminal was closed: its end follows
+                termios.tcflush(sys.stdin, termios.TCIFLUSH)
             console.input(f"{text}, step back and press Enter. ")
         except (KeyboardInterrupt, EOFError):
             interrupted = True
         finally:
             signal.signal(signal.SIGINT, handler)
         if interrupted:
+            console.print()  # the end of the prompt's line
             signal.raise_signal(signal.SIGINT)
         bar.start()
 

@@ -88,6 +88,12 @@ class ActuatorFaultError(CarlabError, OSError):
     exit_code = 4
 
 
+def first_line(error: BaseException) -> str:
+    """First line of the text of an error, with the last one after a colon; without a text its type."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return f"{lines[0]} {lines[-1].strip()}" if lines[0].endswith(":") and len(lines) > 1 else lines[0]
+
+
 def add_sentence(error: BaseException, sentence: str) -> None:
     """Append a sentence to the message of a CarlabError; another error gets it as a note, which its traceback shows."""
     if isinstance(error, CarlabError):

@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.errors import ConfigError, DataError
+from carlab.core.errors import ConfigError, DataError, first_line
 from carlab.core.extras import install_hint
 from carlab.core.version import VERSION
 from carlab.jobs.child_jobs import ChildJob, Executor, JobEnd, LocalExecutor, run_job
@@ -136,12 +136,6 @@ def _require_listener(address: str) -> None:
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_S).close()
-
-
-def first_line(error: BaseException) -> str:
-    """First line of the text of an error, with the last one after a colon; without a text its type."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return f"{lines[0]} {lines[-1].strip()}" if lines[0].endswith(":") and len(lines) > 1 else lines[0]
 
 
 def _run_here(version: str, job: ChildJob) -> JobEnd:

@@ -15,7 +15,7 @@ from carlab.core.planar import to_body, to_world
 from carlab.core.quantities import FloatArray
 from carlab.prediction.initial_states import as_recorded
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
-from learning.world.disturbance import RolloutModel, start_rollouts
+from learning.rollouts import RolloutModel
 from learning.world.drive_windows import DriveWindows
 
 N_SAMPLES = 64
@@ -49,7 +49,7 @@ def sample_paths(
     generator = torch.Generator().manual_seed(seed)
     first = encode(initial_states, past_commands)
     features = torch.from_numpy(first).float().repeat_interleave(n_samples, dim=0)
-    rollouts = start_rollouts(dynamics, len(features), generator)
+    rollouts = dynamics.rollouts(len(features), generator)
     states = [decode_state(features).view(len(initial_states), n_samples, 6)]
     for command in np.moveaxis(commands, 1, 0):
         action = torch.from_numpy(np.ascontiguousarray(command)).float().repeat_interleave(n_samples, dim=0)

@@ -21,6 +21,7 @@ import logging
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import unicodedata
@@ -59,6 +60,8 @@ class RunDirectory:
     ) -> Self:
         """Create ``root/<date>_<time>_<name>`` with the folder of its episodes, its configuration and environment.
 
+        If this fails or is interrupted, no folder remains.
+
         Args:
             root: Folder of all runs, usually ``runs``.
             name: Name of the run; characters that are invalid in file names become ``-``.
@@ -73,6 +76,7 @@ class RunDirectory:
         base = Path(root) / f"{stamp}_{slug}"
         if base.parent.exists() and not base.parent.is_dir():
             raise DataError(f"{base.parent} is a file, not a folder for runs; choose another folder.")
+        facts = {**environment(), **(metadata or {})}
         with writing(base):
             base.parent.mkdir(parents=True, exist_ok=True)
             path, number = base, 1
@@ -80,9 +84,13 @@ class RunDirectory:
                 number += 1
                 path = base.with_name(f"{base.name}-{number}")
             run = cls(path)
-            run.episodes.mkdir()
-            (path / "config.toml").write_text(config_toml, encoding="utf-8")
-            run.write_json("environment.json", {**environment(), **(metadata or {})})
+            try:
+                run.episodes.mkdir()
+                (path / "config.toml").write_text(config_toml, encoding="utf-8")
+                run.write_json("environment.json", facts)
+            except BaseException:
+                shutil.rmtree(path, ignore_errors=True)
+                raise
         return run
 
     @classmethod

@@ -28,10 +28,12 @@ from carlab.studies.curve_prior import unbroken_parts, with_curves
 from carlab.studies.regression.cases import Data
 from carlab.studies.regression.methods import FitTask
 from carlab.studies.regression.recordings import RecordedCase
+from carlab.studies.regression.study import Progress
 from learning.evaluation import negative_log_likelihood
+from learning.rollouts import RolloutModel
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
-from learning.world.disturbance import DisturbedCar, RolloutModel
+from learning.world.disturbance import DisturbedCar
 from learning.world.disturbance_fit import MAX_WINDOWS, RolloutErrors, fit_disturbance, pooled, rollout_errors
 from learning.world.rollout_fit import fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
@@ -51,7 +53,6 @@ N_SAMPLES = 200
 LEVEL = 0.9
 """Nominal coverage of the bands."""
 INDEPENDENT, DISTURBED = "independent steps", "one particle, disturbance"
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)

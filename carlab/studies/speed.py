@@ -28,7 +28,7 @@ def measure_speed(
     from learning.devices import device_name
     from learning.speed import prediction_speed, sac_speed, training_speed
     from mocap.speed import natnet_decode_speed
-    from sim_backends.speed import SingleTorchThread, gradient_speed, simulation_speed
+    from sim_backends.speed import gradient_speed, simulation_speed, single_torch_thread
 
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
     machine = {"cores_count": len(cores), "python": platform.python_version(), "learning_device": device_name(device)}
@@ -37,7 +37,7 @@ def measure_speed(
     where = "one core" if device == "cpu" else device
     try:
         _pin(one)
-        with SingleTorchThread():  # Two threads that synchronise on one core are a hundred times slower.
+        with single_torch_thread():  # Two threads that synchronise on one core are a hundred times slower.
             note("simulation against a plain loop, one core")
             figures["simulation"] = simulation_speed()
             note("gradient of a rollout against central differences, one core")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import threading
 import time
 
@@ -16,15 +15,17 @@ from drivers.links.can_link import open_bus
 from drivers.links.link import CanFrame
 from drivers.vesc import can_codec as vesc_can_codec
 from drivers.vesc.can_codec import CanReassembler, Packet, ReplyMode
+from drivers.vesc.payloads import Command
 
 POLL_S = 0.005
 STATUS_PACKETS = (Packet.STATUS_1, Packet.STATUS_4, Packet.STATUS_5)
 _SIMPLE = {
-    Packet.SET_DUTY: ("duty", 1e5),
-    Packet.SET_CURRENT: ("current", 1e3),
-    Packet.SET_CURRENT_BRAKE: ("brake", 1e3),
-    Packet.SET_RPM: ("rpm", 1.0),
+    Packet.SET_DUTY: Command.SET_DUTY,
+    Packet.SET_CURRENT: Command.SET_CURRENT,
+    Packet.SET_CURRENT_BRAKE: Command.SET_CURRENT_BRAKE,
+    Packet.SET_RPM: Command.SET_RPM,
 }
+"""Motor commands whose data are those of the serial payload, without its command id."""
 
 
 class CanFirmware(Resource):
@@ -103,8 +104,8 @@ class CanFirmware(Resource):
             return
         if vesc_can_codec.packet_of(frame) in _SIMPLE and len(frame.data) >= 4:
             self._note_first(frame, now_s)
-            name, scale = _SIMPLE[Packet(vesc_can_codec.packet_of(frame))]
-            self.firmware.set_motor(name, struct.unpack_from(">i", frame.data)[0] / scale, now_s)
+            command = _SIMPLE[Packet(vesc_can_codec.packet_of(frame))]
+            self.firmware.handle(bytes((command,)) + frame.data, now_s)
         elif vesc_can_codec.packet_of(frame) == Packet.PING and frame.data:
             self._note_first(frame, now_s)
             self._send(bus, vesc_can_codec.pong(frame.data[0], own_id))

@@ -17,14 +17,15 @@ import tty
 from collections import deque
 from pathlib import Path
 
+from carlab.core.errors import NotReadyError
 from carlab.core.resource import Resource
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.links.lines import BITS_PER_BYTE
 from drivers.vesc.serial_codec import VescFrameDecoder, encode_frame
 
 POLL_S = 0.005
-BITS_PER_BYTE = 10
 
 
 class SerialFirmware(Resource):
@@ -71,7 +72,7 @@ class SerialFirmware(Resource):
         return str(self.link) if self.link is not None else self._terminal
 
     def open(self) -> None:
-        """Create the terminal and start serving. Idempotent."""
+        """Create the terminal and start serving. Idempotent. Raises NotReadyError if the link cannot be made."""
         if self._thread is not None:
             return
         self.log.open()
@@ -108,8 +109,13 @@ class SerialFirmware(Resource):
             os.close(slave)
             os.set_blocking(master, False)
             if self.link is not None:
-                self.link.unlink(missing_ok=True)
-                self.link.symlink_to(self._terminal)
+                try:
+                    self.link.unlink(missing_ok=True)
+                    self.link.symlink_to(self._terminal)
+                except OSError as error:
+                    os.close(master)
+                    remedy = f"{error.strerror}; choose a folder in which you may write."
+                    raise NotReadyError(f"The link {self.link} to the serial port cannot be made", (remedy,)) from error
             self.decoder.clear()
             self._received.clear()
             self._outgoing.clear()

@@ -88,7 +88,7 @@ class VescFirmware:
         command, data = payload[0], payload[1:]
         if command in _SETTERS and len(data) >= 4:
             name, scale = _SETTERS[Command(command)]
-            self.set_motor(name, struct.unpack_from(">i", data)[0] / scale, t_s)
+            self._set_motor(name, struct.unpack_from(">i", data)[0] / scale, t_s)
         elif command == Command.SET_SERVO_POS and len(data) >= 2:
             self._set_servo(struct.unpack_from(">h", data)[0] / SERVO_SCALE, t_s)
         elif command == Command.ALIVE:
@@ -105,15 +105,6 @@ class VescFirmware:
             (mask,) = struct.unpack_from(">I", data)
             return payload[:5] + _telemetry_bytes(self.values(t_s), mask)
         return None
-
-    def set_motor(self, name: str, value: float, t_s: float) -> None:
-        """Execute a decoded motor command (simple CAN frames use this)."""
-        self.log.add(t_s, name, value)
-        self._feed(t_s)
-        if self.fault_code or self.kill_switch:
-            name, value = "release", 0.0
-        if self.on_motor is not None:
-            self.on_motor(t_s, name, value)
 
     def values(self, t_s: float) -> MotorValues:
         """Telemetry at ``t_s``."""
@@ -138,6 +129,14 @@ class VescFirmware:
     def _feed(self, t_s: float) -> None:
         self._t_fed_s = t_s
         self._is_timed_out = False
+
+    def _set_motor(self, name: str, value: float, t_s: float) -> None:
+        self.log.add(t_s, name, value)
+        self._feed(t_s)
+        if self.fault_code or self.kill_switch:
+            name, value = "release", 0.0
+        if self.on_motor is not None:
+            self.on_motor(t_s, name, value)
 
     def _set_servo(self, position: float, t_s: float) -> None:
         position = min(1.0, max(0.0, position))

@@ -13,7 +13,7 @@ import can
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
 from drivers.links.bus_lock import BusLock
-from drivers.links.link import CanFrame, LinkStatistics
+from drivers.links.link import CanFrame
 
 BUS_OFF: Final = 0x40
 """Bit of a Linux CAN error frame's identifier (CAN_ERR_BUSOFF)."""
@@ -71,7 +71,7 @@ class CanLink:
         self.interface = interface
         self.channel = channel
         self.bitrate = bitrate
-        self.statistics = LinkStatistics()
+        self.opens = 0
         self._bus: can.BusABC | None = None
         self._descriptor: int | None = None
         self._locks = [
@@ -102,7 +102,7 @@ class CanLink:
             self._descriptor = None
         if self._descriptor is not None and self._descriptor < 0:
             self._descriptor = None
-        self.statistics.opens += 1
+        self.opens += 1
 
     def write(self, frame: CanFrame) -> None:
         """Send a data frame with a 29-bit identifier. Raises ActuatorFaultError if the bus does not accept it."""
@@ -126,7 +126,6 @@ class CanLink:
             if message is None:
                 break
             if message.is_error_frame:
-                self.statistics.error_frames += 1
                 if message.arbitration_id & BUS_OFF:
                     self._flush()
                     raise self._failed("the controller went bus-off")

@@ -1,4 +1,4 @@
-"""Interfaces of links: byte streams and frame buses, with counts of events."""
+"""Interfaces of links: byte streams and frame buses, with the number of openings."""
 
 from __future__ import annotations
 
@@ -14,19 +14,12 @@ class CanFrame:
     data: bytes
 
 
-@dataclass(slots=True)
-class LinkStatistics:
-    """Counts since construction."""
-
-    writes: int = 0
-    error_frames: int = 0
-    opens: int = 0
-
-
 class ByteLink(Protocol):
     """A byte stream. Constructing does nothing. Every failure after ``open`` is an ActuatorFaultError."""
 
-    statistics: LinkStatistics
+    @property
+    def opens(self) -> int:
+        """Number of openings since construction."""
 
     def open(self) -> None:
         """Connect. Raises NotReadyError with the remedy."""
@@ -47,7 +40,9 @@ class ByteLink(Protocol):
 class FrameLink(Protocol):
     """A frame bus, otherwise like ``ByteLink``."""
 
-    statistics: LinkStatistics
+    @property
+    def opens(self) -> int:
+        """Number of openings since construction."""
 
     def open(self) -> None:
         """Connect. Raises NotReadyError with the remedy."""

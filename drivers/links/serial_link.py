@@ -14,7 +14,6 @@ import serial
 from serial.tools import list_ports
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
-from drivers.links.link import LinkStatistics
 
 WRITE_TIMEOUT_S: Final = 0.04
 DRAIN_S: Final = 0.02
@@ -38,14 +37,11 @@ class SerialLink:
     ``setting`` is the name of the port in ``[hardware.actuator]``, for messages.
     """
 
-    def __init__(
-        self, port: str, baud: int = 115200, write_timeout_s: float = WRITE_TIMEOUT_S, *, setting: str = "port"
-    ) -> None:
+    def __init__(self, port: str, baud: int = 115200, *, setting: str = "port") -> None:
         self.port = port
         self.baud = baud
-        self.write_timeout_s = write_timeout_s
         self.setting = setting
-        self.statistics = LinkStatistics()
+        self.opens = 0
         self._serial: serial.Serial | None = None
 
     def open(self) -> None:
@@ -58,7 +54,7 @@ class SerialLink:
         except (OSError, ValueError, OverflowError, termios.error) as error:  # SerialException is an OSError
             raise NotReadyError(f"Serial port {self.port} cannot be opened", (self._reason(error),)) from error
         self._serial = port
-        self.statistics.opens += 1
+        self.opens += 1
 
     def write(self, data: bytes) -> None:
         """Write all of ``data``. Raises ActuatorFaultError on a time-out or a lost port.
@@ -69,28 +65,15 @@ class SerialLink:
         try:
             if port.out_waiting > BACKLOG_LIMIT_BYTES:
                 port.reset_output_buffer()
-            is_written = self._write_all(port.fileno(), data)
+            is_written = _write_all(port.fileno(), data)
+            if not is_written:
+                port.reset_output_buffer()
         except (OSError, termios.error) as error:
             raise self._lost(error) from error
         if not is_written:
-            self._discard_output()
             raise ActuatorFaultError(
                 f"{self.port} accepts no more bytes; check that the device is powered, then reset the fault."
             )
-        self.statistics.writes += 1
-
-    def _write_all(self, fd: int, data: bytes) -> bool:
-        """Write ``data``; False if the port stays full for ``write_timeout_s``.
-
-        ``Serial.write`` also times out if this process was suspended although the port took every byte.
-        """
-        while data:
-            try:
-                data = data[os.write(fd, data) :]
-            except BlockingIOError:
-                if not select.select([], [fd], [], self.write_timeout_s)[1]:
-                    return False
-        return True
 
     def read(self) -> bytes:
         """Bytes that have arrived. Raises ActuatorFaultError if the port was removed."""
@@ -126,13 +109,6 @@ class SerialLink:
             raise ActuatorFaultError(f"{self.port} is not open; open the car first.")
         return self._serial
 
-    def _discard_output(self) -> None:
-        if self._serial is not None:
-            try:
-                self._serial.reset_output_buffer()
-            except (OSError, termios.error) as error:
-                raise self._lost(error) from error
-
     def _lost(self, error: BaseException) -> ActuatorFaultError:
         return ActuatorFaultError(f"{self.port} was lost ({error}); check cable and power, then reset the fault.")
 
@@ -146,6 +122,20 @@ class SerialLink:
         if "exclusively lock" in str(error) or getattr(error, "errno", 0) in (errno.EAGAIN, errno.EBUSY):
             return "another program uses it; close that program."
         return f"{error}. Check that '{self.setting}' in [hardware.actuator] names the device."
+
+
+def _write_all(fd: int, data: bytes) -> bool:
+    """Write ``data``; False if the port stays full for ``WRITE_TIMEOUT_S``.
+
+    ``Serial.write`` also times out if this process was suspended although the port took every byte.
+    """
+    while data:
+        try:
+            data = data[os.write(fd, data) :]
+        except BlockingIOError:
+            if not select.select([], [fd], [], WRITE_TIMEOUT_S)[1]:
+                return False
+    return True
 
 
 def _exclude_other_programs(descriptor: int) -> None:

@@ -40,7 +40,6 @@ class SlcanLink:
         self.channel = channel
         self.bitrate = bitrate
         self._serial = SerialLink(*slcan_port(channel), setting="channel")
-        self.statistics = self._serial.statistics
         self._received = b""
 
     def open(self) -> None:
@@ -61,6 +60,11 @@ class SlcanLink:
         except ActuatorFaultError as error:
             self._serial.close()
             raise NotReadyError(f"CAN bus slcan {self.channel} cannot be opened", (str(error),)) from error
+
+    @property
+    def opens(self) -> int:
+        """Number of openings since construction."""
+        return self._serial.opens
 
     def write(self, frame: CanFrame) -> None:
         """Send a data frame with a 29-bit identifier. Raises ActuatorFaultError if the adapter does not take it."""

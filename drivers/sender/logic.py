@@ -21,6 +21,7 @@ MAX_LAST_BRAKING_S = 1.5
 It is shorter than the time for which the main process waits for the end of the sender."""
 REST_ERPM = 200.0
 """Largest motor speed of a car at rest [electrical rev/min], the default limit for arming."""
+SAFETY_STOP = "The car was stopped for safety; check the car, then reset the fault and arm again."
 
 
 class SenderState(enum.IntEnum):
@@ -241,7 +242,7 @@ class SenderLogic:
                 self._begin_neutral(self.state)
         elif order.request == Request.STOP_AND_LATCH:
             self._begin_neutral(self.state)
-            self._latch("The car was stopped for safety; check the car, then reset the fault and arm again.")
+            self._latch(SAFETY_STOP)
         elif order.request == Request.RESET_FAULT:
             self._reset_fault(now_s)
         elif order.request == Request.SHUT_DOWN:

@@ -7,7 +7,6 @@ runs in a thread.
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import socket
 import time
@@ -318,8 +317,3 @@ def _time_suspended_s() -> float:
 
 def _known(value: float | None) -> float:
     return float("nan") if value is None else value
-
-
-def parent_watch(parent: int) -> Callable[[], bool]:
-    """Return a check that the process ``parent`` still runs (a forked sibling may hold the wake line open)."""
-    return lambda: os.getppid() == parent

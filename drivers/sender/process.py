@@ -27,7 +27,7 @@ from drivers.config import ActuatorConfig
 from drivers.device import Device
 from drivers.device_kinds import DEVICE_KINDS, DeviceKind
 from drivers.sender.logic import ORDER_SIZE, Order
-from drivers.sender.loop import SenderLoop, parent_watch
+from drivers.sender.loop import SenderLoop
 from drivers.sender.slots import Slot, anonymous_file
 from drivers.sender.status import STATUS_SIZE, SenderStatus
 
@@ -61,8 +61,8 @@ class Sender(Protocol):
         """Close the wake line (the sender sends neutral and ends), wait for a bounded time, and free all resources."""
 
 
-class _Channel:
-    """Slots and wake line on the side of the main process."""
+class _StartedSender:
+    """Slots and wake line of a sender, on the side of the main process."""
 
     def __init__(self) -> None:
         self.orders = Slot.create(ORDER_SIZE)
@@ -85,12 +85,7 @@ class _Channel:
                 self._last = SenderStatus.unpack(newest[1])
         return self._last
 
-    def close_wake_line(self) -> None:
-        """Close the wake line; for the sender this is the end of the main process."""
-        self.wake.close()
-
-    def close(self) -> None:
-        """Free everything."""
+    def _free(self) -> None:
         self.wake.close()
         self.sender_wake.close()
         self.orders.close()
@@ -128,24 +123,23 @@ class ErrorOutput:
         return os.pread(self.descriptor, os.fstat(self.descriptor).st_size, 0).decode("utf-8", "replace")
 
 
-class SenderProcess:
+class SenderProcess(_StartedSender):
     """The sender's process, started on construction; ``Actuator`` owns and closes it."""
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> None:
-        self._channel = _Channel()
+        super().__init__()
         self._errors = ErrorOutput()
         try:
             self._process = self._start(config, calibration)
         except BaseException:
-            self._channel.close()
+            self._free()
             self._errors.close()
             raise
-        self._channel.sender_wake.close()
+        self.sender_wake.close()
         self.pid = self._process.pid
 
     def _start(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> subprocess.Popen[bytes]:
-        channel = self._channel
-        descriptors = (channel.orders.descriptor, channel.statuses.descriptor, channel.sender_wake.fileno())
+        descriptors = (self.orders.descriptor, self.statuses.descriptor, self.sender_wake.fileno())
         settings = json.dumps(
             {
                 "device_kind": dataclasses.asdict(config.device_kind),
@@ -164,14 +158,6 @@ class SenderProcess:
             start_new_session=True,
             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         )
-
-    def post(self, order: Order) -> None:
-        """Publish the newest order and wake the sender."""
-        self._channel.post(order)
-
-    def status(self) -> SenderStatus:
-        """The newest status."""
-        return self._channel.status()
 
     def is_alive(self) -> bool:
         """Whether the process still runs."""
@@ -206,40 +192,30 @@ class SenderProcess:
 
         A process that waits in a driver of the kernel, for a device that hangs, ends only after that wait.
         """
-        self._channel.close_wake_line()
+        self.wake.close()
         if not self.join(2.0):
             self._process.kill()
             self.join(2.0)
-        self._channel.close()
+        self._free()
         self._errors.close()
 
 
-class SenderThread:
+class SenderThread(_StartedSender):
     """The sender as a thread, for buses that exist only within one process (python-can's ``virtual``)."""
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration, device: Device | None = None) -> None:
-        self._channel = _Channel()
-        channel = self._channel
-        self.loop = SenderLoop(
+        super().__init__()
+        loop = SenderLoop(
             config.device_kind.load()(config) if device is None else device,
             config,
             calibration,
-            channel.orders,
-            channel.statuses,
-            channel.sender_wake,
+            self.orders,
+            self.statuses,
+            self.sender_wake,
             lambda: True,
         )
-        self._thread = threading.Thread(target=self.loop.run, name="sender", daemon=True)
+        self._thread = threading.Thread(target=loop.run, name="sender", daemon=True)
         self._thread.start()
-        self.pid = os.getpid()
-
-    def post(self, order: Order) -> None:
-        """Publish the newest order and wake the sender."""
-        self._channel.post(order)
-
-    def status(self) -> SenderStatus:
-        """The newest status."""
-        return self._channel.status()
 
     def is_alive(self) -> bool:
         """Whether the thread still runs."""
@@ -260,9 +236,9 @@ class SenderThread:
 
     def close(self) -> None:
         """Close the wake line and wait; a thread that does not end keeps its memory."""
-        self._channel.close_wake_line()
+        self.wake.close()
         if self.join(5.0):
-            self._channel.close()
+            self._free()
 
 
 def start_sender(config: ActuatorConfig, calibration: ActuatorCalibration) -> Sender:
@@ -294,13 +270,12 @@ def main(arguments: list[str]) -> int:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    is_main_alive = parent_watch(int(arguments[4]))
-    orders_fd, statuses_fd, wake_fd = (int(a) for a in arguments[:3])
+    orders_fd, statuses_fd, wake_fd, main_pid = (int(arguments[i]) for i in (0, 1, 2, 4))
     settings = json.loads(arguments[3])
     DEVICE_KINDS[settings["actuator"]["kind"]] = DeviceKind(**settings["device_kind"])
     config = from_table(ActuatorConfig, settings["actuator"], "the sender's settings")
     calibration = from_table(ActuatorCalibration, settings["calibration"], "the sender's settings")
-    orders, statuses = Slot.attach(orders_fd, ORDER_SIZE), Slot.attach(statuses_fd, STATUS_SIZE)
+    orders, statuses = Slot(orders_fd, ORDER_SIZE), Slot(statuses_fd, STATUS_SIZE)
     is_realtime = config.realtime_priority and _try_realtime()
     with socket.socket(fileno=wake_fd) as wake:
         wake.setblocking(False)
@@ -311,7 +286,7 @@ def main(arguments: list[str]) -> int:
             orders,
             statuses,
             wake,
-            is_main_alive,
+            lambda: os.getppid() == main_pid,  # a forked worker of the main process may hold the wake line open
             is_realtime=is_realtime,
         )
         gc.collect()

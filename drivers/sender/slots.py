@@ -29,7 +29,10 @@ def anonymous_file(name: str) -> int:
 
 
 class Slot:
-    """One writer, any number of readers. Construct with ``create`` or, in the other process, ``attach``."""
+    """One writer, any number of readers. ``create`` makes a slot.
+
+    The other process constructs it with an inherited or duplicated descriptor, which the slot then owns.
+    """
 
     def __init__(self, descriptor: int, capacity: int) -> None:
         self.descriptor = descriptor
@@ -48,11 +51,6 @@ class Slot:
         except BaseException:
             os.close(descriptor)
             raise
-
-    @classmethod
-    def attach(cls, descriptor: int, capacity: int) -> Self:
-        """Map a slot by an inherited or duplicated descriptor; the slot then owns the descriptor."""
-        return cls(descriptor, capacity)
 
     def write(self, value: bytes) -> None:
         """Publish ``value`` atomically for readers. Raises ValueError if it is too long or the slot is closed."""

@@ -34,7 +34,7 @@ class VescCanDevice:
     @property
     def counters(self) -> DeviceCounters:
         """Counts since construction."""
-        return DeviceCounters(self._reassembler.errors, self._replies.garbage_bytes, self.link.statistics.opens)
+        return DeviceCounters(self._reassembler.errors, self._replies.garbage_bytes, self.link.opens)
 
     def open(self) -> None:
         """Open the bus."""

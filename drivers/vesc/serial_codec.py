@@ -43,7 +43,6 @@ class VescFrameDecoder:
     """
 
     frame_timeout_s: float | None = 0.1
-    frames: int = 0
     crc_errors: int = 0
     garbage_bytes: int = 0
     _buffer: bytearray = field(default_factory=bytearray)
@@ -86,7 +85,6 @@ class VescFrameDecoder:
                 self._drop_byte()
                 continue
             payloads.append(bytes(self._buffer[start:end]))
-            self.frames += 1
             self._remove(end + 3)
 
     def _frame_span(self) -> tuple[int, int] | None:

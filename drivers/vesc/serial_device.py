@@ -36,7 +36,7 @@ class VescSerialDevice:
         return DeviceCounters(
             decoder.crc_errors,
             decoder.garbage_bytes + self._replies.garbage_bytes,
-            self.link.statistics.opens,
+            self.link.opens,
         )
 
     def open(self) -> None:

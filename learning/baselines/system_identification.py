@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -29,14 +28,6 @@ PRIOR_ROWS = 1.0
 
 Losses = Callable[[Tensor], Tensor]
 """Losses (S,) at offsets (S, K)."""
-
-
-class Predictor(Protocol):
-    """A predictive distribution."""
-
-    def predict(self, inputs: Tensor) -> Mixture:
-        """Prediction at inputs (N, D)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +55,14 @@ class IdentifiedSimulator:
 
 @dataclass(frozen=True, slots=True)
 class GreyBox:
-    """An identified simulator and particles for its error."""
+    """An identified simulator, and a prediction of its error at inputs (N, D)."""
 
     simulator: IdentifiedSimulator
-    error: Predictor
+    error: Callable[[Tensor], Mixture]
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at inputs (N, D)."""
-        error = self.error.predict(inputs)
+        error = self.error(inputs)
         return replace(error, means=error.means + self.simulator.mean(inputs))
 
 

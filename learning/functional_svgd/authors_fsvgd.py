@@ -37,6 +37,7 @@ from learning.posterior.sampler import PosteriorSampler
 from learning.priors.domain_models import draw_parameters
 from learning.priors.function_prior import RbfCovariance
 from learning.priors.simulator_model import CarModel
+from learning.rollouts import StatelessModel
 from learning.transitions import transitions_of
 
 STATE_STD = (3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0)
@@ -71,7 +72,7 @@ def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, cor
 
 
 @dataclass(frozen=True, slots=True)
-class WorldDynamics:
+class WorldDynamics(StatelessModel):
     """Particles that predict changes in the world frame.
 
     Attributes:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
 from learning.evaluation import negative_log_likelihood
+from learning.networks.adam import half_cosine
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.posterior.particle_posterior import ParticlePosterior, input_clip_of
@@ -30,6 +31,7 @@ from learning.priors.function_prior import JITTER, Marginal, RbfCovariance, gaus
 from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 PROGRESS_PERIOD_STEPS = 500
+FINAL_RATE_SHARE = 0.01
 MIN_NOISE = 1e-4
 """Lower bound of the likelihood's standard deviation, in normalised units."""
 
@@ -188,8 +190,9 @@ class _Optimiser:
 
     def set_rate(self, step: int) -> None:
         """Set the learning rate of a step."""
-        cosine = 0.01 + 0.495 * (1.0 + math.cos(math.pi * step / self.settings.steps))
-        rate = self.settings.learning_rate * (cosine if self.settings.anneal_rate else 1.0)
+        rate = self.settings.learning_rate
+        if self.settings.anneal_rate:
+            rate *= half_cosine(step, self.settings.steps, FINAL_RATE_SHARE)
         for group in self.adam.param_groups:
             group["lr"] = rate * group.get("rate_factor", 1.0)
 

@@ -6,12 +6,18 @@ overhead is a large part of a step.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
+
+
+def half_cosine(step: int, steps: int, final_share: float) -> float:
+    """Share of the initial learning rate at a step: it falls along a half cosine from 1 to ``final_share``."""
+    return final_share + (1.0 - final_share) * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 
 @dataclass

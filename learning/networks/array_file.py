@@ -18,16 +18,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, first_line
 
 MAX_BYTES = 256_000_000
 """Maximum size of the arrays of one file; a policy or a learned car has some hundred kilobytes."""
 TOO_LARGE = f"it holds more than {MAX_BYTES / 1e6:.0f} MB"
-_UNREADABLE = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, NotImplementedError, RuntimeError),
-    *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, SyntaxError, RecursionError, tokenize.TokenError),
-    *(ArithmeticError, struct.error),
+UNREADABLE = (
+    *(OSError, ValueError, LookupError, TypeError, EOFError, MemoryError, RuntimeError, ArithmeticError, SyntaxError),
+    *(struct.error, tokenize.TokenError, zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error),
 )
+"""Errors of reading a damaged file."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Tensor | int]) -> None:
@@ -48,8 +48,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
         check_archive(path)
         with np.load(path, allow_pickle=False) as opened:
             arrays = {name: opened[name] for name in opened.files}
-    except _UNREADABLE as error:
-        raise DataError(next(iter(str(error).splitlines()), "") or type(error).__name__) from error
+    except UNREADABLE as error:
+        raise DataError(first_line(error)) from error
     for name, array in arrays.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
             raise DataError(f"{name} holds no numbers")

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from learning.evaluation import Prediction, WeightedMixture
+from learning.evaluation import Predictor, WeightedMixture
 
 MAX_FOLDS = 10
 """Maximum number of folds; with so many rows or fewer, each row is left out once."""
@@ -23,15 +22,7 @@ MIN_WEIGHT = 0.01
 """Models with a smaller weight are left out of the average."""
 
 
-class Model(Protocol):
-    """A fitted model."""
-
-    def prediction(self, inputs: Tensor) -> Prediction:
-        """Prediction at raw inputs (N, D)."""
-        ...
-
-
-Fit = Callable[[Tensor, Tensor], Model]
+Fit = Callable[[Tensor, Tensor], Predictor]
 """Fit of a model to raw inputs (n, D) and outputs (n, O)."""
 
 
@@ -39,12 +30,12 @@ Fit = Callable[[Tensor, Tensor], Model]
 class AveragedModel:
     """Models with weights (K,) that sum to 1."""
 
-    models: Sequence[Model]
+    models: Sequence[Predictor]
     weights: Tensor
 
     def predict(self, inputs: Tensor) -> WeightedMixture:
         """Prediction at raw inputs (N, D)."""
-        return WeightedMixture([model.prediction(inputs) for model in self.models], self.weights)
+        return WeightedMixture([model.predict(inputs) for model in self.models], self.weights)
 
 
 def average(fits: Sequence[Fit], inputs: Tensor, outputs: Tensor, seed: int = 0) -> AveragedModel:
@@ -62,19 +53,17 @@ def average(fits: Sequence[Fit], inputs: Tensor, outputs: Tensor, seed: int = 0)
     return AveragedModel(models, weights[chosen] / weights[chosen].sum())
 
 
-def held_out_log_densities(
-    fits: Sequence[Fit], inputs: Tensor, outputs: Tensor, seed: int = 0, max_folds: int = MAX_FOLDS
-) -> Tensor:
+def held_out_log_densities(fits: Sequence[Fit], inputs: Tensor, outputs: Tensor, seed: int = 0) -> Tensor:
     """Log density (K, n) of each row by each model fitted without the row's fold."""
     count = len(inputs)
     densities = torch.zeros((len(fits), count), dtype=torch.float64)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
-    for fold in torch.arange(count).tensor_split(min(max_folds, count)):
+    for fold in torch.arange(count).tensor_split(min(MAX_FOLDS, count)):
         held_out, kept = order[fold], torch.ones(count, dtype=torch.bool)
         kept[held_out] = False
         at_kept, at_held_out = kept.to(inputs.device), held_out.to(inputs.device)
         for k, fit in enumerate(fits):
-            prediction = fit(inputs[at_kept], outputs[at_kept]).prediction(inputs[at_held_out])
+            prediction = fit(inputs[at_kept], outputs[at_kept]).predict(inputs[at_held_out])
             densities[k, held_out] = prediction.log_density(outputs[at_held_out]).double().cpu()
     return densities
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from learning.networks.adam import Adam
+from learning.networks.adam import Adam, half_cosine
 
 STEPS = 120
 LEARNING_RATE, FINAL_RATE_SHARE = 0.08, 0.05
@@ -91,18 +91,21 @@ class DiscrepancyCovariance:
 
         Inputs of width D + O end in the simulator's outputs; those of width D have no multiplicative part.
         """
-        second = first if second is None else second
+        return self._terms(first, first if second is None else second)[0]
+
+    def _terms(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The covariance as of ``__call__``, its smooth term, and its multiplicative term if any."""
         outputs, width = self.lengthscales.shape
         a, b = first[..., :width], second[..., :width]
         shape = (outputs, *[1] * first.ndim)
-        covariance = _rbf(a, b, self.lengthscales).mul_(self.scales.view(shape) ** 2)
-        covariance.add_(_scaled_inner_product(a, b, self.slopes)).add_(self.offsets.view(shape) ** 2)
+        smooth = _rbf(a, b, self.lengthscales).mul_(self.scales.view(shape) ** 2)
+        covariance = _scaled_inner_product(a, b, self.slopes).add_(smooth).add_(self.offsets.view(shape) ** 2)
         if first.shape[-1] == width:
-            return covariance
+            return covariance, smooth, None
         scaled = [self.multiplier_stds.view(shape[:-1]) * x[..., width:].movedim(-1, 0) for x in (first, second)]
         multiplicative = _rbf(a, b, self.multiplier_lengthscales)
         multiplicative.mul_(scaled[0][..., :, None]).mul_(scaled[1][..., None, :])
-        return covariance.add_(multiplicative)
+        return covariance.add_(multiplicative), smooth, multiplicative
 
     def with_pullback(self, inputs: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
         """The covariance matrix of inputs, and its derivative in closed form.
@@ -114,16 +117,8 @@ class DiscrepancyCovariance:
             The covariance (O, n, n), and the map from a symmetric gradient with respect to it to the gradients with
             respect to the logarithms of the six attributes, in their order.
         """
-        width = self.lengthscales.shape[1]
-        x = inputs[:, :width]
-        smooth = _rbf(x, x, self.lengthscales).mul_(self.scales[:, None, None] ** 2)
-        covariance = _scaled_inner_product(x, x, self.slopes).add_(smooth).add_(self.offsets[:, None, None] ** 2)
-        multiplicative: Tensor | None = None
-        if inputs.shape[1] > width:
-            scaled = self.multiplier_stds[:, None] * inputs[:, width:].T
-            multiplicative = _rbf(x, x, self.multiplier_lengthscales)
-            multiplicative.mul_(scaled[:, :, None]).mul_(scaled[:, None, :])
-            covariance.add_(multiplicative)
+        x = inputs[:, : self.lengthscales.shape[1]]
+        covariance, smooth, multiplicative = self._terms(inputs, inputs)
 
         def lengthscale_gradient(weighted: Tensor, lengthscales: Tensor) -> Tensor:
             """Gradient with respect to the log lengthscales (O, D), from a gradient times their covariance term."""
@@ -264,8 +259,7 @@ def _maximise_posterior(
             rows = torch.randperm(count, generator=generator)[:BATCH_ROWS].to(residual.device)
         covariance, pullback = evaluate(logs, rows)
         gradients = pullback(evidence_gradient(residual[..., rows, :], covariance))
-        cosine = 0.5 * (1.0 + math.cos(math.pi * step / STEPS))
-        rate = LEARNING_RATE * (FINAL_RATE_SHARE + (1.0 - FINAL_RATE_SHARE) * cosine)
+        rate = LEARNING_RATE * half_cosine(step, STEPS, FINAL_RATE_SHARE)
         prior_gradients = [(v - m) / width**2 for v, m, width in zip(logs, medians, log_stds, strict=True)]
         for optimiser, gradient, prior_gradient in zip(optimisers, gradients, prior_gradients, strict=True):
             optimiser.step(gradient + prior_gradient, rate)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
 from learning.devices import CapturedFunction, can_capture
-from learning.networks.adam import Adam
+from learning.networks.adam import Adam, half_cosine
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.function_posterior import JITTER, FunctionPosterior
@@ -232,7 +232,7 @@ def _train(
         adam.step(-pullback(direction.transpose(2, 3).flatten(1, 2)), rate)
         return {}
 
-    rates = [_rate(step, settings) for step in range(settings.steps)]
+    rates = [settings.learning_rate * half_cosine(k, settings.steps, FINAL_RATE_SHARE) for k in range(settings.steps)]
     replayed = CapturedFunction(train_step) if can_capture(parameters.device) else None
     device_rates = torch.tensor(rates).to(parameters.device)
     for step, sets in enumerate(order.to(parameters.device)):
@@ -242,12 +242,6 @@ def _train(
             replayed(sets, device_rates[step])
         if (step + 1) % PROGRESS_PERIOD_STEPS == 0:
             progress(step + 1)
-
-
-def _rate(step: int, settings: DistillationSettings) -> float:
-    """Learning rate of a step: a half cosine."""
-    cosine = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
-    return settings.learning_rate * (FINAL_RATE_SHARE + (1.0 - FINAL_RATE_SHARE) * cosine)
 
 
 def measurement_points(

@@ -71,15 +71,7 @@ class FunctionPosterior:
         ]
         return torch.cat([m for m, _ in batches]), torch.cat([c for _, c in batches])
 
-    def predict(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and scale (N, O) of a measurement at raw inputs (N, D), in raw units.
-
-        The scale is that of the Student-t distribution; it is the standard deviation if ``dof`` is infinite.
-        """
-        prediction = self.prediction(inputs)
-        return prediction.means[0], prediction.marginal_scales[0]
-
-    def prediction(self, inputs: Tensor) -> Mixture:
+    def predict(self, inputs: Tensor) -> Mixture:
         """Joint prediction of all outputs of a measurement at raw inputs (N, D), in raw units."""
         mean, covariance = self.marginals(inputs[:, None])
         std = (covariance[:, :, 0, 0].clamp_min(0.0) + self.noise_std**2).sqrt().float()

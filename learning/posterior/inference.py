@@ -204,6 +204,12 @@ class _Estimate:
             inputs, weights = inputs[rows], weights[rows]
         return _covariance(self.discrepancy, inputs, self.noise_std, weights)
 
+    def covariance_with_parameters(self, row_weights: Tensor) -> Tensor:
+        """Covariances (O, n, n) of discrepancy, noise and outputs of the parameter draws, for weights (n,)."""
+        prior = _covariance(self.discrepancy, self.residual.inputs, self.noise_std, row_weights)
+        of_parameters = self.residual.parameter_covariance
+        return prior if of_parameters is None else prior + of_parameters
+
 
 def _best_of_restarts(problem: _Problem, scales: Sequence[float]) -> FunctionPosterior:
     """Fit with several prior sizes of the discrepancy, and select by the leave-one-out density of the rows.
@@ -273,12 +279,7 @@ def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, genera
         torch.ones_like(noise), torch.zeros_like(ones),
     )  # fmt: skip
     if problem.has_student_noise:
-
-        def covariance(row_weights: Tensor) -> Tensor:
-            prior = _covariance(discrepancy, residual.inputs, noise, row_weights)
-            return prior if residual.parameter_covariance is None else prior + residual.parameter_covariance
-
-        estimate.row_weights = initial_row_weights(residual.mean, covariance, noise)
+        estimate.row_weights = initial_row_weights(residual.mean, estimate.covariance_with_parameters, noise)
     return estimate
 
 
@@ -322,11 +323,9 @@ def _fit_student_noise(problem: _Problem, estimate: _Estimate) -> tuple[Tensor, 
     Returns:
         Scales (O,) of the standardised leave-one-out errors, and their predictive variances (n, O).
     """
-    residual, noise = estimate.residual, estimate.noise_std
-    covariance = estimate.covariance()
-    if residual.parameter_covariance is not None:
-        covariance = covariance + residual.parameter_covariance
-    standardised, variance = leave_one_out(residual.mean, covariance, noise, estimate.row_weights)
+    noise = estimate.noise_std
+    covariance = estimate.covariance_with_parameters(estimate.row_weights)
+    standardised, variance = leave_one_out(estimate.residual.mean, covariance, noise, estimate.row_weights)
     estimate.correlation, width = output_correlation(standardised)
     dof, estimate.row_weights = student_weights(mahalanobis_sq(standardised, estimate.correlation), len(noise))
     estimate.dof = min(dof, problem.max_dof)

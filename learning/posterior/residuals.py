@@ -14,13 +14,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.evaluation import Mixture
-from learning.outliers import (
-    DOF_CANDIDATES,
-    DOF_MIN_GAIN_NATS,
-    log_student,
-    mahalanobis_sq,
-    output_correlation,
-)
+from learning.outliers import DOF_CANDIDATES, log_student, mahalanobis_sq, most_likely_dof, output_correlation
 
 SCALE_ITERATIONS = 60
 """Iterations of the expectation maximisation of the common scale."""
@@ -99,16 +93,19 @@ def fit_residuals(
     square = mahalanobis_sq(errors / scales, correlation)
     prior_square = 0.0 if prior_std is None else float((unit / scales).square().sum())
     free_rows = max(count - fitted_rows, 0.0)
-    best, dof, scale = -math.inf, math.inf, 1.0
-    for candidate in DOF_CANDIDATES:
-        s = _common_scale(square, outputs, candidate, weight, prior_square)
-        log_likelihood = float(log_student(square / s**2, outputs, candidate).sum()) - count * outputs * math.log(s)
-        if log_likelihood > best + DOF_MIN_GAIN_NATS:
-            best, dof, scale = log_likelihood, candidate, s
+
+    def scale_for(dof: float) -> float:
+        return _common_scale(square, outputs, dof, weight, prior_square)
+
+    def log_likelihood(dof: float) -> float:
+        s = scale_for(dof)
+        return float(log_student(square / s**2, outputs, dof).sum()) - count * outputs * math.log(s)
+
+    dof = most_likely_dof(log_likelihood)
     max_dof = max(free_rows + weight, MIN_DOF)
     # Residuals of fitted rows are smaller than errors at new rows.
     variance_factor = (count + weight) / max(free_rows + weight, 1.0)
-    factor = torch.linalg.cholesky(correlation) * scales[:, None] * scale * math.sqrt(variance_factor)
+    factor = torch.linalg.cholesky(correlation) * scales[:, None] * scale_for(dof) * math.sqrt(variance_factor)
     return ResidualDistribution(factor, min(dof, max_dof))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -66,14 +66,11 @@ def uniform(ranges: Sequence[Range], count: int, generator: torch.Generator) -> 
 class Sinusoids:
     """``a sin(w x) + b x`` with a ~ N(2, 0.4^2), w ~ U(1.7, 2.3), b ~ N(2, 1), for x in [-5, 5]."""
 
+    size: ClassVar[int] = 3
+
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
         """Values of x (N, 1)."""
         return uniform(((-5.0, 5.0),), count, generator)
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return 3
 
     def parameters(self, normal: Tensor) -> Tensor:
         """a, w, b (P, 3) for standard normal draws (P, 3)."""
@@ -130,6 +127,7 @@ class Pendulum:
         substeps: Euler steps in it.
     """
 
+    size: ClassVar[int] = 8
     masses: Range = (0.5, 1.5)
     lengths: Range = (0.5, 1.5)
     gravities: Range = (5.0, 15.0)
@@ -145,11 +143,6 @@ class Pendulum:
         """Sine and cosine of angles in [-pi, pi], rates within 5 rad/s, torques within 2.5 N m: (N, 4)."""
         drawn = uniform(((-math.pi, math.pi), (-5.0, 5.0), (-2.5, 2.5)), count, generator)
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
-
-    @property
-    def size(self) -> int:
-        """Five, and three coefficients of the discrepancy."""
-        return 8
 
     def parameters(self, normal: Tensor) -> Tensor:
         """m, l, g, nu, drag and three coefficients of the discrepancy (P, 8), for standard normal draws (P, 8)."""
@@ -176,6 +169,16 @@ class Pendulum:
         return after - inputs[None, :, :3]
 
 
+KINEMATIC_RANGES: tuple[Range, ...] = (
+    *((1.6, 1.7), (0.11, 0.15), (0.15, 0.19), (-0.15, 0.15)),
+    *((6.0, 10.0), (1.0, 1.8), (0.15, 0.4)),
+)
+"""Ranges of mass [kg], l_f and l_r (distances of the axles from the centre of mass) [m], angle between body and
+measured heading [rad], force at full throttle [N], root of the damping [sqrt(N s/m)], wheel angle at full lock [rad].
+"""
+KINEMATIC_PERIOD_S, KINEMATIC_SUBSTEPS = 1.0 / 30.0, 3
+
+
 @dataclass(frozen=True, slots=True)
 class KinematicCar:
     """Change over 1/30 s of (x, y, sin yaw, cos yaw, vx, vy in the world, yaw rate) of a car whose wheels do not slip.
@@ -185,26 +188,10 @@ class KinematicCar:
     measured heading.
 
     Attributes:
-        masses: range of the mass [kg].
-        front_axles, rear_axles: ranges of l_f and l_r, the distances of the axles from the centre of mass [m].
-        offsets: range of the angle between body and measured heading [rad].
-        drives: range of the force at full throttle [N].
-        dampings: range of the square root of the damping [sqrt(N s/m)].
-        steerings: range of the wheel angle at full lock [rad].
-        period_s: duration of a step [s].
-        substeps: integration steps in it.
         place_m, speed_mps, rate_radps: half widths of the domain of positions, velocities and yaw rates.
     """
 
-    masses: Range = (1.6, 1.7)
-    front_axles: Range = (0.11, 0.15)
-    rear_axles: Range = (0.15, 0.19)
-    offsets: Range = (-0.15, 0.15)
-    drives: Range = (6.0, 10.0)
-    dampings: Range = (1.0, 1.8)
-    steerings: Range = (0.15, 0.4)
-    period_s: float = 1.0 / 30.0
-    substeps: int = 3
+    size: ClassVar[int] = 7
     place_m: float = 2.0
     speed_mps: float = 2.0
     rate_radps: float = 3.0
@@ -216,15 +203,9 @@ class KinematicCar:
         yaw = drawn[:, 2:3]
         return torch.cat([drawn[:, :2], torch.sin(yaw), torch.cos(yaw), drawn[:, 3:]], dim=1)
 
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return 7
-
     def parameters(self, normal: Tensor) -> Tensor:
         """m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock (P, 7); normal draws (P, 7)."""
-        ranges = (self.masses, self.front_axles, self.rear_axles, self.offsets, self.drives, self.dampings)
-        return within((*ranges, self.steerings), torch.special.ndtr(normal))
+        return within(KINEMATIC_RANGES, torch.special.ndtr(normal))
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Changes (P, N, 7) at inputs (N, 9) for parameters (P, 7)."""
@@ -235,9 +216,9 @@ class KinematicCar:
         ahead, left = to_body(inputs[None, :, 4], inputs[None, :, 5], yaw)
         rate = inputs[None, :, 6].expand_as(ahead)
         x, y = (inputs[None, :, k].expand_as(ahead) for k in (0, 1))
-        step = self.period_s / self.substeps
+        step = KINEMATIC_PERIOD_S / KINEMATIC_SUBSTEPS
         decay = math.exp(-1.0)  # of a deviation from rolling without slip, in one substep
-        for _ in range(self.substeps):
+        for _ in range(KINEMATIC_SUBSTEPS):
             next_ahead = ahead + step * (drive * throttle - damping**2 * ahead) / mass
             mean_ahead = 0.5 * (ahead + next_ahead)
             rolling_rate = next_ahead * tangent / (front + rear)

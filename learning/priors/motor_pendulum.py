@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -40,6 +41,7 @@ class MotorPendulum:
             are discrepancy processes inside the dynamics.
     """
 
+    size: ClassVar[int] = 13
     masses: Range = (0.5, 1.5)
     lengths: Range = (0.5, 1.5)
     gravities: Range = (5.0, 15.0)
@@ -57,11 +59,6 @@ class MotorPendulum:
         spans = (math.pi, 5.0, 2.5, 2.5)
         drawn = uniform(tuple((-v, v) for v in spans), count, generator)
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
-
-    @property
-    def size(self) -> int:
-        """Seven, and six coefficients of the discrepancy."""
-        return 13
 
     def parameters(self, normal: Tensor) -> Tensor:
         """m, l, g, nu, drag, dry, lag; coefficients of rate, rate |rate|, rate^2, sign, command, past command.

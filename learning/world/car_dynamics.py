@@ -7,9 +7,8 @@ noise of the likelihood (aleatoric uncertainty).
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -20,23 +19,11 @@ from carlab.core.observation import STATE_FEATURES, decode_history, decode_state
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.posterior.sampler import PosteriorSampler
+from learning.rollouts import StatelessModel
 from learning.transitions import transitions_of
 
 
-class OneStep(Protocol):
-    """One-step dynamics of a learned car."""
-
-    @property
-    def history(self) -> int:
-        """H, number of commands before the last one in a row of inputs."""
-        ...
-
-    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) one step after ``action`` (N, 2), sampled from the predictive distribution."""
-        ...
-
-
-class StepInBody(ABC):
+class StepInBody(StatelessModel):
     """A step by exact kinematics, from changes sampled in the body frame at its start."""
 
     __slots__ = ()
@@ -57,19 +44,15 @@ class CarDynamics(StepInBody):
     Attributes:
         posterior: particles and noise.
         history: H, number of commands before the last one in a row of inputs.
+        sampler: of the particles.
     """
 
     posterior: ParticlePosterior
     history: int
-    _sampler: PosteriorSampler = field(init=False, repr=False, compare=False)
+    sampler: PosteriorSampler = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_sampler", PosteriorSampler.of(self.posterior))
-
-    @property
-    def sampler(self) -> PosteriorSampler:
-        """Sampler of the particles."""
-        return self._sampler
+        object.__setattr__(self, "sampler", PosteriorSampler.of(self.posterior))
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Predictive distribution of changes at inputs (N, 3 + 2 (H + 1))."""
@@ -77,7 +60,7 @@ class CarDynamics(StepInBody):
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """One sample (N, 6) of the mixture for each row of inputs (N, 3 + 2 (H + 1))."""
-        return self._sampler(inputs, generator)
+        return self.sampler(inputs, generator)
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps [nat per step], and calibration error.

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import struct
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, first_line
 from carlab.core.observation import STATE_FEATURES
 from learning.functional_svgd.authors_fsvgd import WorldDynamics
-from learning.networks.array_file import MAX_BYTES, TOO_LARGE, check_archive, read_arrays, whole_number, write_arrays
+from learning.networks.array_file import (
+    MAX_BYTES,
+    TOO_LARGE,
+    UNREADABLE,
+    check_archive,
+    read_arrays,
+    whole_number,
+    write_arrays,
+)
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
@@ -58,6 +64,7 @@ _SIMULATOR_KEY, _DRAWS_KEY = "simulator", "simulator_parameters"
 _OPTIONAL_KEYS = (_DECORRELATION_KEY, "trend", "correlation", _INPUT_CLIP_KEY)
 _FRAMES = ("body", "world")
 _ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
+_READ_ERRORS = (*UNREADABLE, AttributeError, AssertionError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,10 +189,7 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
     """
 
     def read() -> dict[str, Any]:
-        try:
-            check_archive(path)
-        except DataError as error:  # A clause without the file and a remedy.
-            raise ValueError(str(error)) from error
+        check_archive(path)
         content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         return content
 
@@ -225,13 +229,7 @@ def load_car_arrays(path: Path) -> LearnedCar:
             "activation": _ACTIVATIONS[whole_number(arrays, "activation")], "units": [tensors[k] for k in _UNITS],
         }  # fmt: skip
 
-    def read_or_refuse() -> dict[str, Any]:
-        try:
-            return read()
-        except DataError as error:  # A clause without the file and a remedy.
-            raise ValueError(str(error)) from error
-
-    return _read(path, "cpu", read_or_refuse)
+    return _read(path, "cpu", read)
 
 
 def _content(dynamics: LearnedCar) -> dict[str, Any]:
@@ -263,16 +261,14 @@ def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, A
     try:
         content = read()
         version = content["version"]
-        if version not in (FILE_VERSION, SIMULATOR_FILE_VERSION):
-            known = f"{FILE_VERSION} and {SIMULATOR_FILE_VERSION}"
-            raise DataError(f"{path} has version {version}, this program reads versions {known}; {remedy}.")
-        return _car_of(content, device)
-    except DataError:
-        raise
+        if version in (FILE_VERSION, SIMULATOR_FILE_VERSION):
+            return _car_of(content, device)
     except pickle.UnpicklingError as error:  # its own message recommends to read the file unsafely
         raise DataError(f"{path} holds more than numbers, so it is no learned car; {remedy}.") from error
     except _READ_ERRORS as error:
-        raise DataError(f"The learned car in {path} cannot be read ({_first_line(error)}); {remedy}.") from error
+        raise DataError(f"The learned car in {path} cannot be read ({first_line(error)}); {remedy}.") from error
+    known = f"{FILE_VERSION} and {SIMULATOR_FILE_VERSION}"
+    raise DataError(f"{path} has version {version}, this program reads versions {known}; {remedy}.")
 
 
 def _car_of(content: Mapping[str, Any], device: torch.device | str) -> LearnedCar:
@@ -305,13 +301,8 @@ def _simulator_of(content: Mapping[str, Any]) -> ParticleSimulator:
     if content.get("frame", "body") != "body":
         raise ValueError("a simulator of steps in the world frame")
     model, draws = model_of(content[_SIMULATOR_KEY], content["history"]), content[_DRAWS_KEY]
-    if not isinstance(draws, Tensor) or draws.layout != torch.strided or not draws.is_floating_point():
-        raise ValueError(f"{_DRAWS_KEY} is not an array of numbers")
-    wanted = (len(content["parameters"]), model.size)
-    if tuple(draws.shape) != wanted:
-        raise ValueError(f"{_DRAWS_KEY} has shape {tuple(draws.shape)}, not {wanted}")
-    if draws.device.type != "cpu" or not torch.isfinite(draws).all():
-        raise ValueError(f"{_DRAWS_KEY} is not finite")
+    _check_array(_DRAWS_KEY, draws, (len(content["parameters"]), model.size))
+    _check_finite({_DRAWS_KEY: draws})
     return ParticleSimulator(model, draws.float())
 
 
@@ -337,29 +328,27 @@ def _check_parts(content: Mapping[str, Any], network: Network) -> None:
     }  # fmt: skip
     parts = dict(content) | dict(zip(_UNITS, content["units"], strict=True))
     given = {name: parts[name] for name in shapes if name not in _OPTIONAL_KEYS or parts[name] is not None}
-    total = 0
     for name, part in given.items():
-        if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
-            raise ValueError(f"{name} is not an array of numbers")
-        size = part.numel() * part.element_size()
-        if part.device.type != "cpu" or part.untyped_storage().nbytes() < size:  # one stored number at many indices
-            raise ValueError(f"{name} has fewer numbers than its shape")
-        total += size
-        wanted = tuple(size or max(len(part), 1) for size in shapes[name]) if part.ndim else shapes[name]
-        if tuple(part.shape) != wanted:
-            raise ValueError(f"{name} has shape {tuple(part.shape)}, not {wanted}")
-    if total > MAX_BYTES:
+        _check_array(name, part, shapes[name])
+    if sum(part.numel() * part.element_size() for part in given.values()) > MAX_BYTES:
         raise ValueError(TOO_LARGE)
-    if infinite := next((name for name, part in given.items() if not torch.isfinite(part).all()), None):
-        raise ValueError(f"{infinite} is not finite")
+    _check_finite(given)
 
 
-_READ_ERRORS = (
-    *(OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError),
-    *(ArithmeticError, MemoryError, struct.error, pickle.UnpicklingError, zipfile.BadZipFile),
-)
+def _check_array(name: str, part: Any, shape: tuple[int | None, ...]) -> None:
+    """Raise ValueError if a part of a file is no array of numbers of a shape, in which None is any positive size."""
+    if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
+        raise ValueError(f"{name} is not an array of numbers")
+    size = part.numel() * part.element_size()
+    if part.device.type != "cpu" or part.untyped_storage().nbytes() < size:  # one stored number at many indices
+        raise ValueError(f"{name} has fewer numbers than its shape")
+    wanted = tuple(max(len(part), 1) if n is None else n for n in shape) if part.ndim else shape
+    if tuple(part.shape) != wanted:
+        raise ValueError(f"{name} has shape {tuple(part.shape)}, not {wanted}")
 
 
-def _first_line(error: BaseException) -> str:
-    """The first line of an error's message, or its type."""
-    return next(iter(str(error).splitlines()), "") or type(error).__name__
+def _check_finite(parts: Mapping[str, Tensor]) -> None:
+    """Raise ValueError for the first array with a number that is not finite."""
+    for name, part in parts.items():
+        if not torch.isfinite(part).all():
+            raise ValueError(f"{name} is not finite")

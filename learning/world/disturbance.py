@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from learning.outliers import tail_scales
 from learning.posterior.sampler import Assignment
-from learning.world.car_dynamics import CarDynamics, OneStep, advance, inputs_of
+from learning.world.car_dynamics import CarDynamics, advance, inputs_of
 
 CHANNELS = ("ahead_mps2", "left_mps2", "yaw_radps2")
 """Accelerations of the disturbance."""
@@ -88,40 +87,6 @@ class DisturbedCar:
         return DisturbedRollouts(self, count, generator)
 
 
-class Rollouts(Protocol):
-    """N rollouts of a learned car, which advance together."""
-
-    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
-        ...
-
-    def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Start other rollouts in place of those with indices ``rows`` (M,)."""
-        ...
-
-    def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """Noise (N, 6) of measured states, positions along the body axes; None if the steps contain it."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class IndependentSteps:
-    """Rollouts whose steps sample particle and noise independently."""
-
-    model: OneStep
-
-    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
-        return self.model.step(features, action, generator)
-
-    def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Do nothing for ``rows`` (M,): no state lasts from step to step."""
-
-    def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """None: the steps contain the noise (N, 6)."""
-        return None
-
-
 class DisturbedRollouts:
     """Rollouts of a disturbed car: each has one particle and one path of the disturbance."""
 
@@ -149,26 +114,3 @@ class DisturbedRollouts:
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
         """Noise (N, 6) of the one-step likelihood, in the order of ``transitions.OUTPUTS``."""
         return self._sampler.noise_samples(len(self._unit), generator)
-
-
-@runtime_checkable
-class HasRollouts(Protocol):
-    """A model whose rollouts have a state of their own, such as one particle or one car each."""
-
-    @property
-    def history(self) -> int:
-        """H, number of past commands in the features."""
-        ...
-
-    def rollouts(self, count: int, generator: torch.Generator) -> Rollouts:
-        """Start N rollouts."""
-        ...
-
-
-RolloutModel = OneStep | HasRollouts
-"""Models that rollouts can be sampled from."""
-
-
-def start_rollouts(model: RolloutModel, count: int, generator: torch.Generator) -> Rollouts:
-    """Start N rollouts; steps of a model without a disturbance are independent."""
-    return model.rollouts(count, generator) if isinstance(model, HasRollouts) else IndependentSteps(model)

@@ -19,6 +19,7 @@ from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_history, decode_state, encode, push_action
 from learning.priors.simulator_model import CarModel, known_ranges
+from learning.rollouts import StatelessModel
 from learning.transitions import whole_steps
 from sim_backends.array_ops import FLOATS
 from sim_backends.batch.rollout import rollout
@@ -42,8 +43,8 @@ MAX_ERROR = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class DrawnCars:
-    """N simulated cars; a rollout of the world that a policy drives in.
+class DrawnCars(StatelessModel):
+    """N simulated cars; a rollout of the world that a policy drives in. Its states are exact, without noise.
 
     Attributes:
         config: the simulator, with the effects of all cars.
@@ -63,35 +64,21 @@ class DrawnCars:
         """The cars with indices (M,)."""
         return replace(self, values={name: value[cars] for name, value in self.values.items()})
 
-    def rollouts(self, count: int, generator: torch.Generator) -> DrawnRollouts:
-        """Start rollouts of ``count`` cars, in turn."""
-        return DrawnRollouts(self.take(torch.arange(count) % len(self)))
+    def rollouts(self, count: int, generator: torch.Generator) -> DrawnCars:
+        """Start rollouts of ``count`` cars, in turn; hidden states of a car follow from the features."""
+        return self.take(torch.arange(count) % len(self))
 
     def after(self, states: Tensor, commands: Tensor, past: Tensor) -> Tensor:
         """States (N, T + 1, 6) of the cars from states (N, 6) by commands (N, T, 2) after past ones (N, H, 2)."""
         return rollout(self.config, states, commands, history=past, values=self.values).states
 
-
-class DrawnRollouts:
-    """Rollouts of drawn cars, each with one car; implements ``learning.world.disturbance.Rollouts``."""
-
-    def __init__(self, cars: DrawnCars) -> None:
-        self._cars = cars
-
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
         past = decode_history(features)
-        state = self._cars.after(decode_state(features), action[:, None], past)[:, 1]
+        state = self.after(decode_state(features), action[:, None], past)[:, 1]
         state = torch.cat([state[:, :2], wrap(state[:, 2:3]), state[:, 3:]], dim=1)
         encoded: Tensor = encode(torch.nan_to_num(state, nan=1e3), push_action(past, action))
         return encoded
-
-    def restart(self, rows: Tensor, generator: torch.Generator) -> None:
-        """Keep the cars for ``rows`` (M,): their hidden states follow from the features."""
-
-    def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
-        """None, without noise (N, 6): the states are exact."""
-        return None
 
 
 def draw_cars(prior: SimulatorConfig, count: int, generator: torch.Generator, history: int = HISTORY) -> DrawnCars:

@@ -43,7 +43,7 @@ class HistoryChoice:
         )
 
 
-def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoice | None:
+def find_history(episodes: Sequence[EpisodeData]) -> HistoryChoice | None:
     """Choose the shortest history by the leave-one-out likelihood of a Gaussian process (``MIN_GAIN_NATS``).
 
     The process has a lengthscale for each input and is fitted by its evidence to the same rows for every length. The
@@ -51,7 +51,6 @@ def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoic
 
     Args:
         episodes: recordings.
-        seed: of the random subset of rows.
 
     Returns:
         The choice; None with fewer than ``MIN_ROWS`` rows.
@@ -65,7 +64,7 @@ def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoic
     rows = transitions_of(episodes, longest)
     if len(rows) < MIN_ROWS:
         return None
-    chosen = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:MAX_ROWS].numpy()
+    chosen = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:MAX_ROWS].numpy()
     all_inputs, outputs = (torch.from_numpy(v[chosen]) for v in (rows.inputs, rows.targets))
     all_inputs = (all_inputs - all_inputs.mean(dim=0)) / all_inputs.std(dim=0).clamp_min(1e-6)
     outputs = (outputs - outputs.mean(dim=0)) / outputs.std(dim=0).clamp_min(1e-9)

@@ -21,7 +21,7 @@ from carlab.core.geofence import can_stop_inside_batch, stopping_distance_m
 from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import Task
-from learning.world.disturbance import RolloutModel, start_rollouts
+from learning.rollouts import RolloutModel
 
 FEATURE_UNITS = (2.0, 2.0, 1.0, 1.0, 2.0, 1.0, 4.0)
 """Units of x, y [m], sine, cosine, vx, vy [m/s] and yaw rate [rad/s] in a policy's inputs."""
@@ -107,7 +107,7 @@ class ModelEnv(VecEnv):
         self._own_seed = seed
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator().manual_seed(seed)
-        self._rollouts = start_rollouts(model, cars, self._generator)
+        self._rollouts = model.rollouts(cars, self._generator)
         self._features = torch.zeros((cars, width), device=self._device)
         self._ticks = np.zeros(cars, dtype=np.int64)
         self._actions = torch.zeros((cars, ACTION_SIZE), device=self._device)

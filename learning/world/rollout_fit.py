@@ -16,7 +16,6 @@ All errors have a Huber loss, so that collisions have a bounded influence.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -26,7 +25,7 @@ from torch.nn import functional
 
 from carlab.core.errors import DataError, DivergedError
 from carlab.core.robust import STD_OVER_MAD
-from learning.networks.adam import Adam
+from learning.networks.adam import Adam, half_cosine
 from learning.networks.particles import Layers
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.posterior.sampler import with_raw_outputs
@@ -34,6 +33,21 @@ from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.drive_windows import DriveWindows, roll_out
 from learning.world.local_steps import LocalSteps
+
+FINAL_RATE_SHARE = 0.01
+"""Share of the learning rate at the end: one-step errors of a millimetre need a small one."""
+ANCHOR_DISTANCE = 0.5
+"""Standard deviation of the inputs of the anchor around those of the windows, in units of the inputs."""
+ROLLOUT_HUBER = 1.0
+"""Error of a rollout, in units of the errors before, from which its loss is linear."""
+ONE_STEP_HUBER = 1.5
+"""One-step error, in standard deviations of the noise, from which its loss is linear."""
+MIN_UNIT_SHARE = 0.1
+"""Minimum unit of an error in a rollout, as a share of the unit at the end."""
+MAX_GRADIENT = 1.0
+"""Maximum norm of a particle's gradient: a rollout that diverges has a very large one."""
+PROGRESS_PERIOD = 50
+"""Updates between two reports of progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,26 +61,12 @@ class RolloutFitSettings:
     rows: int = 256
     """Rows of each particle in a gradient step, for the one-step errors."""
     learning_rate: float = 3e-3
-    """Initial learning rate of Adam; it falls to ``final_rate_share`` of it along a half cosine."""
-    final_rate_share: float = 0.01
-    """One-step errors of a millimetre need a small learning rate at the end."""
+    """Initial learning rate of Adam; it falls along a half cosine."""
     one_step_weight: float = 0.2
     """Weight of one-step errors. Without them the one-step likelihood falls by 2 nats; a weight of 1 takes two thirds
     of the gain over a second."""
     anchor_weight: float = 0.3
     """Weight of the squared distance from the function before, in units of the outputs."""
-    anchor_distance: float = 0.5
-    """Standard deviation of the inputs of this distance around those of the windows, in units of the inputs."""
-    rollout_huber: float = 1.0
-    """Error of a rollout, in units of the errors before, from which its loss is linear."""
-    one_step_huber: float = 1.5
-    """One-step error, in standard deviations of the noise, from which its loss is linear."""
-    min_unit_share: float = 0.1
-    """Minimum unit of an error in a rollout, as a share of the unit at the end."""
-    max_gradient: float = 1.0
-    """Maximum norm of a particle's gradient: a rollout that diverges has a very large one."""
-    progress_period: int = 50
-    """Updates between two reports of progress."""
 
 
 def fit_rollouts(
@@ -112,17 +112,13 @@ def fit_rollouts(
     for update in range(settings.updates):
         chosen = torch.multinomial(weights, settings.windows, replacement=True, generator=generator).to(device)
         batch = torch.randint(len(inputs), (particles, settings.rows), generator=generator).to(device)
-        adam.step(problem.gradient(parameters, chosen, batch, unit, generator), _rate(settings, update))
-        if (update + 1) % settings.progress_period == 0:
+        rate = settings.learning_rate * half_cosine(update, settings.updates, FINAL_RATE_SHARE)
+        adam.step(problem.gradient(parameters, chosen, batch, unit, generator), rate)
+        if (update + 1) % PROGRESS_PERIOD == 0:
             progress(update + 1)
     if not torch.isfinite(parameters).all():
         raise DivergedError("the fit to rollouts gave values that are not finite")
     return CarDynamics(replace(car.posterior, parameters=parameters), car.history)
-
-
-def _rate(settings: RolloutFitSettings, update: int) -> float:
-    cosine = 0.5 * (1.0 + math.cos(math.pi * update / settings.updates))
-    return settings.learning_rate * (settings.final_rate_share + (1.0 - settings.final_rate_share) * cosine)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +164,7 @@ class _Problem:
             paths = self._paths(_Functions.of(posterior, layers), chosen.expand(particles, -1))
         error = paths.mean(dim=0) - self.windows.motion[chosen].to(paths)
         unit = STD_OVER_MAD * error.abs().median(dim=0).values
-        return torch.maximum(unit, self.settings.min_unit_share * unit[-1]).clamp_min(1e-6)
+        return torch.maximum(unit, MIN_UNIT_SHARE * unit[-1]).clamp_min(1e-6)
 
     def gradient(
         self, parameters: Tensor, chosen: Tensor, batch: Tensor, unit: Tensor, generator: torch.Generator
@@ -186,31 +182,30 @@ class _Problem:
         network = self.car.posterior.network
         layers = [(w.detach().requires_grad_(), b.detach().requires_grad_()) for w, b in network.split(parameters)]
         functions = _Functions.of(self.car.posterior, layers)
-        settings = self.settings
         loss = self._rollout_loss(functions, chosen, unit)
-        loss = loss + settings.one_step_weight * self._one_step_loss(functions, batch)
-        loss = loss + settings.anchor_weight * self._anchor_loss(functions, chosen, generator)
+        loss = loss + self.settings.one_step_weight * self._one_step_loss(functions, batch)
+        loss = loss + self.settings.anchor_weight * self._anchor_loss(functions, chosen, generator)
         parts = torch.autograd.grad(loss, [leaf for layer in layers for leaf in layer])
         gradient = torch.cat([part.flatten(1) for part in parts], dim=1)
         norm: Tensor = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-        return gradient * (settings.max_gradient / norm.clamp_min(settings.max_gradient))
+        return gradient * (MAX_GRADIENT / norm.clamp_min(MAX_GRADIENT))
 
     def _rollout_loss(self, functions: _Functions, chosen: Tensor, unit: Tensor) -> Tensor:
         """Sum over particles of the loss of their rollouts over windows (L, n)."""
         error = self._paths(functions, chosen) - self.windows.motion[chosen].float()
-        return _huber(error / unit, self.settings.rollout_huber).mean(dim=(1, 2, 3)).sum()
+        return _huber(error / unit, ROLLOUT_HUBER).mean(dim=(1, 2, 3)).sum()
 
     def _one_step_loss(self, functions: _Functions, batch: Tensor) -> Tensor:
         """Sum over particles of the loss of their steps at rows (L, m)."""
         posterior = self.car.posterior
         particle = torch.arange(len(batch), device=batch.device)[:, None]
         error = (functions.normalised(self.inputs[batch]) - self.outputs[particle, batch]) / posterior.noise_std
-        return _huber(error, self.settings.one_step_huber).mean(dim=(1, 2)).sum()
+        return _huber(error, ONE_STEP_HUBER).mean(dim=(1, 2)).sum()
 
     def _anchor_loss(self, functions: _Functions, chosen: Tensor, generator: torch.Generator) -> Tensor:
         """Sum over particles of the squared distance from their functions before, around the starts of windows."""
         posterior, inputs = self.car.posterior, self.windows.inputs[chosen]
-        offset = self.settings.anchor_distance * torch.randn(inputs.shape, generator=generator)
+        offset = ANCHOR_DISTANCE * torch.randn(inputs.shape, generator=generator)
         clipped = posterior.clipped_inputs(inputs + offset.to(inputs) * posterior.normaliser.input_std)
         with torch.no_grad():
             before = posterior.without_simulator(clipped)

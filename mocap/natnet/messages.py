@@ -174,16 +174,9 @@ def decode_text(payload: bytes) -> str:
     return _text(payload)
 
 
-class Response(NamedTuple):
-    """Answer to a REQUEST: four bytes are a number whose type depends on the command; other lengths are text."""
-
-    data: bytes
-
-    def as_int(self) -> int:
-        """The answer as int32. Raises ProtocolError."""
-        if len(self.data) != _INT.size:
-            raise ProtocolError(f"NatNet response of {len(self.data)} bytes is no number of 4 bytes.")
-        return int(_INT.unpack(self.data)[0])
+def decode_integer_response(payload: bytes) -> int | None:
+    """Integer answer to a REQUEST, which has four bytes; None for another length, which is text."""
+    return int(_INT.unpack(payload)[0]) if len(payload) == _INT.size else None
 
 
 def encode_response(value: int | float | str) -> bytes:

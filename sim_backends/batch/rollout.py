@@ -247,17 +247,14 @@ class _Batch:
     def _acting_commands(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Steering and throttle acting in each piece of each period, each (before + ticks, cars)."""
         period = torch.arange(-before, self.ticks, device=self.issued.device)[:, None] + 1 + self.past
-        both = []
-        for channel in range(2):
-            newer = (period - plan.command_periods[channel]).clamp_min(0)
-            cars = self.issued.shape[2]
+        cars, both = self.issued.shape[2], []
+        for issued, delay_periods in zip(self.issued, plan.command_periods, strict=True):
+            newer = (period - delay_periods).clamp_min(0)
             indices = (newer, (newer - 1).clamp_min(0))
-            both.append([torch.gather(self.issued[channel], 0, index.expand(-1, cars)) for index in indices])
+            both.append([torch.gather(issued, 0, index.expand(-1, cars)) for index in indices])
+        steering, throttle = both
         return [
-            (
-                _either(piece.new_command[0], both[0][0], both[0][1]),
-                _either(piece.new_command[1], both[1][0], both[1][1]),
-            )
+            (_either(piece.new_command[0], *steering), _either(piece.new_command[1], *throttle))
             for piece in plan.pieces
         ]
 

@@ -80,6 +80,11 @@ class Graph:
 
 @functools.lru_cache(maxsize=256)
 def trace_step(key: Key) -> Graph:
+    """The traced step of a key; nothing may be added to its graph."""
+    return _trace(key)
+
+
+def _trace(key: Key) -> Graph:
     """Trace one step: carried are the states of the body and of the actuators."""
     tracer = Tracer()
     ops = cast(Ops, tracer)
@@ -117,18 +122,10 @@ def compile_gradient(key: Key, wanted: tuple[bool, ...], dtype: np.dtype[Any]) -
 
     ``wanted`` selects the inputs to differentiate by; there is one output for each True.
     """
-    graph = trace_step(key)
-    tracer = Tracer(list(graph.tracer.nodes), dict(graph.tracer._known))
-    moved = {node.index: Node(tracer, node.index, node.operation, node.arguments) for node in tracer.nodes}
-    for index, node in moved.items():
-        node.arguments = tuple(moved[a.index] if isinstance(a, Node) else a for a in node.arguments)
-        tracer.nodes[index] = node
-    tracer._known = {k: moved[node.index] for k, node in tracer._known.items()}
-    seeds = [tracer.input(f"seed{i}") for i in range(len(graph.outputs))]
-    inputs = [moved[node.index] for node in graph.inputs]
-    sources = [node for node, want in zip(inputs, wanted, strict=True) if want]
-    results = gradients([moved[o.index] if isinstance(o, Node) else o for o in graph.outputs], seeds, sources)
-    return compile_function([*inputs, *seeds], results, dtype)
+    graph = _trace(key)
+    seeds = [graph.tracer.input(f"seed{i}") for i in range(len(graph.outputs))]
+    sources = [node for node, want in zip(graph.inputs, wanted, strict=True) if want]
+    return compile_function([*graph.inputs, *seeds], gradients(graph.outputs, seeds, sources), dtype)
 
 
 def address(row: FloatRow) -> int:

@@ -137,9 +137,8 @@ class MeasuredCurve(Effect):
         """
         places = {place: k for k, place in enumerate(free_knots(cls.axes))}
         rows = []
-        for axis, others in enumerate(itertools.repeat(cls.axes, len(cls.axes))):
-            ranges = [range(len(a.knots)) for k, a in enumerate(others) if k != axis]
-            knots = cls.axes[axis].knots
+        for axis, knots in enumerate(a.knots for a in cls.axes):
+            ranges = [range(len(a.knots)) for k, a in enumerate(cls.axes) if k != axis]
             for rest, k in itertools.product(itertools.product(*ranges), range(1, len(knots) - 1)):
                 before, after = knots[k] - knots[k - 1], knots[k + 1] - knots[k]
                 mean = 0.5 * (before + after)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import carlab
 from carlab.cars import choose_car, load_car_file
-from carlab.core.errors import ConfigError
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError, NotReadyError
 
 ARENA = "[hardware.arena]\ncorners_m = [[-1, -1], [1, -1], [1, 1], [-1, 1]]\n"
 
@@ -81,6 +84,15 @@ def test_real_car_that_coasts_further_than_the_geofence_assumes_gives_a_warning(
         choose_car(path)
     assert warning in caplog.text
     assert bool(warning) == bool(caplog.text)
+
+
+def test_replay_on_a_real_car_that_coasts_warns_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = car_file(tmp_path, "hardware.actuator", f'port = "{tmp_path / "missing"}"')
+    commands = np.zeros((3, 2))
+    recording = EpisodeData(np.arange(4) * 0.1, np.zeros((4, 6)), commands, commands, np.zeros(3))
+    with caplog.at_level(logging.WARNING), pytest.raises(NotReadyError):
+        carlab.replay(recording, path, out=tmp_path)
+    assert caplog.text.count("In neutral the car coasts") == 1
 
 
 def test_limits_up_to_their_bounds_are_accepted(tmp_path: Path) -> None:

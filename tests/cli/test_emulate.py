@@ -44,6 +44,14 @@ def test_negative_seed_is_refused(carlab: Carlab, tmp_path: Path) -> None:
     assert "--seed -1: give at least 0." in text
 
 
+def test_port_whose_link_cannot_be_made_is_refused_by_its_name(carlab: Carlab) -> None:
+    """In /proc nobody can make a link, also not a superuser."""
+    code, text = carlab("emulate", "--port", "/proc/vesc", "--command-port", 0, "--data-port", 0)
+    assert code == 3
+    assert "The link /proc/vesc to the serial port cannot be made: " in text
+    assert "/dev/pts" not in text
+
+
 def test_log_that_cannot_be_written_is_refused(carlab: Carlab, tmp_path: Path) -> None:
     emulate = ("emulate", "--port", tmp_path / "vesc", "--log")
     code, text = carlab(*emulate, tmp_path / "missing" / "log.jsonl")

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -143,12 +144,34 @@ def test_interrupt_during_the_placing_prompt_requests_a_stop(monkeypatch: pytest
         signal.sigtimedwait([], 5.0)
         pytest.fail("the prompt was not interrupted")
 
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    master, terminal = os.openpty()
     monkeypatch.setattr("carlab.cli.runs.console.input", interrupted_input)
-    with Interrupts() as interrupts:
+    with os.fdopen(master), os.fdopen(terminal) as keyboard, Interrupts() as interrupts:
+        monkeypatch.setattr(sys, "stdin", keyboard)
         ask_to_place(Progress(disable=True), "")(CarState())
         assert interrupts.count == 1
         assert interrupts.requested.is_set()
+
+
+def test_line_that_was_typed_before_the_prompt_does_not_confirm_the_placing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enter during the last episode or the training: a person may be carrying the car when the next start is asked."""
+    from rich.progress import Progress
+
+    master, terminal = os.openpty()
+    confirmed: list[bool] = []
+
+    def confirm() -> None:
+        confirmed.append(True)
+        os.write(master, b"\n")
+
+    confirming = threading.Timer(0.3, confirm)
+    with os.fdopen(master, "rb"), os.fdopen(terminal) as keyboard:
+        monkeypatch.setattr(sys, "stdin", keyboard)
+        os.write(master, b"\n\n")
+        confirming.start()
+        ask_to_place(Progress(disable=True), "")(CarState())
+        assert confirmed
+        confirming.join()
 
 
 def test_simulated_car_driven_by_hand_runs_in_real_time(

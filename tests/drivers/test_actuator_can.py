@@ -9,13 +9,13 @@ import sys
 import threading
 import time
 import uuid
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from cut_can_bus import CutLink, Wire
 from faulty_frame_link import FaultyFrameLink
+from patient_config import patient_config
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
 from carlab.core.quantities import Action
@@ -70,16 +70,7 @@ with Actuator(config, ActuatorCalibration()) as actuator:
 
 
 def config_for(interface: str, channel: str, **changes: Any) -> ActuatorConfig:
-    config = ActuatorConfig(
-        kind="vesc_can",
-        interface=interface,
-        channel=channel,
-        watchdog_s=2.0,
-        latch_s=30.0,
-        telemetry_stale_s=5.0,
-        telemetry_lost_s=10.0,
-    )
-    return replace(config, **changes)
+    return patient_config(kind="vesc_can", interface=interface, channel=channel, **changes)
 
 
 def channel_name() -> str:

@@ -7,26 +7,23 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from patient_config import patient_config
 
 from carlab.core.errors import ActuatorFaultError, CarlabError
 from carlab.core.quantities import Action
 from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
-from drivers.config import ActuatorConfig
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.sender.logic import SenderState
+from tests.helpers.waiting import TIMEOUT_S
 
 pytestmark = pytest.mark.realtime
 
 MOVING = Action(0.5, 0.3)
-TIMEOUT_S = 20.0
 
 
 def make_actuator(firmware: SerialFirmware) -> Actuator:
-    config = ActuatorConfig(
-        port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
-    )
-    return Actuator(config, ActuatorCalibration())
+    return Actuator(patient_config(port=firmware.port), ActuatorCalibration())
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ import uuid
 from pathlib import Path
 
 import pytest
+from patient_config import patient_config
 
 from carlab.core.errors import NotReadyError
 from carlab.core.quantities import Action
@@ -25,11 +26,11 @@ from drivers.emulators.command_log import CommandLog
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.links.bus_lock import BusLock
 from drivers.links.can_link import CanLink
+from tests.helpers.waiting import TIMEOUT_S, until
 
 pytestmark = pytest.mark.realtime
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMEOUT_S = 20.0
 CHANNEL = f"test-{uuid.uuid4()}"
 HOLDER = """
 import sys, time
@@ -43,10 +44,9 @@ time.sleep(60.0)
 
 def multicast_config() -> ActuatorConfig:
     channel = f"239.74.163.2:{20000 + uuid.uuid4().int % 20000}"
-    return ActuatorConfig(
-        kind="vesc_can", interface="udp_multicast", channel=channel, watchdog_s=25.0, latch_s=30.0,
-        telemetry_stale_s=5.0, telemetry_lost_s=10.0, open_timeout_s=TIMEOUT_S,
-    )  # fmt: skip
+    return patient_config(
+        kind="vesc_can", interface="udp_multicast", channel=channel, watchdog_s=25.0, open_timeout_s=TIMEOUT_S
+    )
 
 
 def test_second_sender_is_refused_and_sends_nothing_to_the_controller() -> None:
@@ -56,10 +56,7 @@ def test_second_sender_is_refused_and_sends_nothing_to_the_controller() -> None:
         with Actuator(config, ActuatorCalibration(max_current_a=10.0)) as first:
             first.arm()
             first.command(Action(0.5, 0.3))
-            end_s = time.monotonic() + TIMEOUT_S
-            while not any(entry.value == 3.0 for entry in log.motor()):
-                assert time.monotonic() < end_s
-                time.sleep(0.01)
+            until(lambda: any(entry.value == 3.0 for entry in log.motor()))
             t_s = time.monotonic()
             sender_pid = first._sender.pid  # type: ignore[union-attr]
             with pytest.raises(NotReadyError, match=rf"is in use: .*process {sender_pid}, .* end that program first"):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import pytest
+from patient_config import patient_config
 
 from carlab.core.car import Car
 from carlab.core.errors import (
@@ -24,11 +25,12 @@ from carlab.core.pose_source import PoseSource
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, PoseSample, Reality
 from carlab.core.state_estimator import StateEstimator
 from drivers.actuator import Actuator
-from drivers.config import ActuatorConfig, HardwareConfig
+from drivers.config import HardwareConfig
 from drivers.dry_run_car import DryRunCar
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.hardware_car import HardwareCar
 from drivers.vesc.payloads import MotorValues
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.realtime
 
@@ -93,11 +95,10 @@ def poses() -> ScriptedPoses:
 
 
 def make_car(port: str, poses: ScriptedPoses, **options: Any) -> HardwareCar:
-    config = ActuatorConfig(port=port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0)
-    hardware = HardwareConfig(config, arm_max_pose_age_s=2.0)
+    hardware = HardwareConfig(patient_config(port=port), arm_max_pose_age_s=2.0)
     return HardwareCar(
         "test car",
-        Actuator(config, hardware.calibration),
+        Actuator(hardware.actuator, hardware.calibration),
         poses,
         StateEstimator(),
         config=hardware,
@@ -142,10 +143,7 @@ def test_restarted_sequence_numbers_are_accepted(car: HardwareCar, poses: Script
 
 def test_arming_reports_every_reason(car: HardwareCar, poses: ScriptedPoses, serial_firmware: SerialFirmware) -> None:
     serial_firmware.firmware.readings = lambda t_s: MotorValues(erpm=3000.0, input_v=11.0)
-    end_s = time.monotonic() + 20.0
-    while not car.actuator.status().erpm > 200.0:
-        assert time.monotonic() < end_s
-        time.sleep(0.002)
+    until(lambda: car.actuator.status().erpm > 200.0)
     with pytest.raises(NotReadyError) as caught:
         car.arm()
     assert len(caught.value.reasons) == 2
@@ -177,10 +175,7 @@ def test_arming_waits_for_late_telemetry(
     monkeypatch.setattr("drivers.hardware_car.ARM_WAIT_S", 20.0)
     car.actuator.config = replace(car.actuator.config, telemetry_stale_s=0.25)
     serial_firmware.faults.drops_replies = True
-    end_s = time.monotonic() + 20.0
-    while not any("telemetry is" in problem for problem in car.actuator.problems()):
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
+    until(lambda: any("telemetry is" in problem for problem in car.actuator.problems()))
     threading.Timer(0.1, setattr, (serial_firmware.faults, "drops_replies", False)).start()
     poses.n_delayed = 4
     car.arm()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from recording_link import RecordingLink
 
 from carlab.core.errors import ConfigError
 from drivers.calibration import ActuatorCalibration
@@ -12,7 +13,7 @@ from drivers.config import ActuatorConfig
 from drivers.device_kinds import DEVICE_KINDS
 from drivers.emulators.vesc_firmware import EMULATED_VERSION, VALUES_AT_REST
 from drivers.links.lines import can_frame_bits, slcan_line_bytes
-from drivers.links.link import CanFrame, LinkStatistics
+from drivers.links.link import CanFrame
 from drivers.links.slcan_link import SlcanLink
 from drivers.vesc.can_codec import ReplyMode, encode_payload
 from drivers.vesc.can_device import VescCanDevice
@@ -21,23 +22,6 @@ from drivers.vesc.serial_codec import encode_frame
 from drivers.vesc.serial_device import VescSerialDevice
 
 REPLY = get_values_selective() + encode_values(VALUES_AT_REST, CONTROL_MASK)
-
-
-class RecordingLink:
-    """A link of bytes or frames that records what is written."""
-
-    def __init__(self) -> None:
-        self.statistics = LinkStatistics()
-        self.written: list[Any] = []
-
-    def open(self) -> None: ...
-    def close(self) -> None: ...
-    def fileno(self) -> None: ...
-    def read(self) -> bytes:
-        return b""
-
-    def write(self, message: Any) -> None:
-        self.written.append(message)
 
 
 def test_sizes_of_serial_messages_are_those_on_the_line() -> None:

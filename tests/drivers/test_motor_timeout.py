@@ -6,6 +6,7 @@ import math
 import threading
 
 import pytest
+from patient_config import patient_config
 
 from carlab.core.quantities import Action
 from drivers.actuator import Actuator
@@ -31,10 +32,7 @@ def served(motor_timeout_s: float) -> SerialFirmware:
 
 
 def connected(firmware: SerialFirmware) -> Actuator:
-    config = ActuatorConfig(
-        port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=9.0
-    )
-    return Actuator(config, CALIBRATION)
+    return Actuator(patient_config(port=firmware.port), CALIBRATION)
 
 
 def test_timeout_is_measured_in_neutral_and_the_car_can_be_armed_afterwards() -> None:

@@ -9,12 +9,12 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from patient_config import patient_config
 
 from carlab.core.errors import ActuatorFaultError
 from carlab.core.quantities import Action
 from drivers.actuator import SILENT_SENDER_S, Actuator
 from drivers.calibration import ActuatorCalibration
-from drivers.config import ActuatorConfig
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.sender.process import SenderProcess
 from tests.helpers.waiting import until
@@ -26,10 +26,7 @@ MOVING = Action(0.5, 0.3)  # 3 A
 
 @pytest.fixture
 def actuator(serial_firmware: SerialFirmware) -> Iterator[Actuator]:
-    config = ActuatorConfig(
-        port=serial_firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
-    )
-    with Actuator(config, ActuatorCalibration(max_current_a=10.0)) as opened:
+    with Actuator(patient_config(port=serial_firmware.port), ActuatorCalibration(max_current_a=10.0)) as opened:
         opened.arm()
         yield opened
 

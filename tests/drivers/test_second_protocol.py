@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import toy_protocol
+from patient_config import patient_config
 from toy_protocol import ToyFirmware
 
 from carlab.core.errors import ActuatorFaultError, ConfigError, NotReadyError
@@ -38,7 +39,7 @@ def firmware() -> Iterator[ToyFirmware]:
 
 
 def config_for(port: str) -> ActuatorConfig:
-    return ActuatorConfig("toy", port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0)
+    return patient_config(kind="toy", port=port)
 
 
 def test_commands_reach_the_firmware_and_stop_ends_in_neutral(firmware: ToyFirmware) -> None:

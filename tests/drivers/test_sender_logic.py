@@ -10,11 +10,11 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recording_link import RecordingLink
 
 from carlab.core.errors import ActionOutOfRangeError
 from carlab.core.quantities import Action
 from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
-from drivers.links.link import LinkStatistics
 from drivers.sender.logic import Order, Request, SenderState
 from drivers.vesc.payloads import FirmwareVersion, MotorValues
 from drivers.vesc.serial_codec import VescFrameDecoder
@@ -252,27 +252,6 @@ def test_same_board_after_a_lost_link_gets_neutral_until_reset_and_armed() -> No
     assert bench.logic.fault == ""
 
 
-class RecordingLink:
-    """A byte link that records the written bytes."""
-
-    def __init__(self) -> None:
-        self.statistics = LinkStatistics()
-        self.written = b""
-
-    def open(self) -> None: ...
-
-    def write(self, data: bytes) -> None:
-        self.written += data
-
-    def read(self) -> bytes:
-        return b""
-
-    def fileno(self) -> None:
-        return None
-
-    def close(self) -> None: ...
-
-
 def motor_and_servo(data: bytes) -> tuple[int, int, int]:
     """Command id, motor number and servo number of the written bytes, decoded by the protocol's layout."""
     motor, servo = VescFrameDecoder().feed(data, 0.0)
@@ -337,9 +316,8 @@ def test_every_frame_is_within_limits_and_neutral_unless_armed(
         command = bench.tick(a if kind == "wait" else 0.01)
         may_move = may_move and bench.logic.state != SenderState.FAULT
         assert command is not None
-        link.written = b""
         device.send(command)
-        identifier, motor, servo = motor_and_servo(link.written)
+        identifier, motor, servo = motor_and_servo(link.written[-1])
         assert abs(motor) <= full[identifier]
         assert 200 <= servo <= 800
         if (motor, servo) != (0, 500):

@@ -8,20 +8,15 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
-from drivers.config import ActuatorConfig
+from drivers.calibration import DeviceCommand, MotorKind
 from drivers.device import DeviceCounters
 from drivers.sender import loop as loop_module
 from drivers.sender.logic import ORDER_SIZE, Order, Request, SenderState
 from drivers.sender.loop import SenderLoop
 from drivers.sender.slots import Slot
 from drivers.sender.status import STATUS_SIZE
-from drivers.vesc.payloads import FirmwareVersion, MotorValues
+from tests.helpers.sender_bench import CALIBRATION, CONFIG, HEALTHY, MOVING, VERSION
 
-CONFIG = ActuatorConfig(rate_hz=100.0, watchdog_s=0.15, latch_s=0.5)
-CALIBRATION = ActuatorCalibration(max_current_a=10.0, servo_min=0.2, servo_max=0.8)
-MOVING = DeviceCommand(MotorKind.CURRENT, 3000, 600)
-HEALTHY = MotorValues(erpm=0.0, input_v=11.1, fault_code=0, status_bits=0)
 SUSPENDED_S = 0.18
 
 
@@ -85,7 +80,7 @@ class Bench:
         )
         self.loop._is_link_open = True
         self.loop.logic.link_up()
-        self.loop.logic.firmware(FirmwareVersion(6, 5, "TEST", b"u" * 12))
+        self.loop.logic.firmware(VERSION)
         self.loop.logic.telemetry(self.time.now_s, HEALTHY)
         self.order(1, Request.ARM, 0)
         self.loop._tick(self.time.now_s)

@@ -78,7 +78,7 @@ def test_sender_that_ends_at_an_import_is_reported_with_its_last_line(
 def test_sender_that_loses_the_main_process_while_it_opens_is_no_silent_device(serial_firmware: SerialFirmware) -> None:
     def start(config: ActuatorConfig, calibration: ActuatorCalibration) -> SenderProcess:
         sender = SenderProcess(config, calibration)
-        sender._channel.close_wake_line()
+        sender.wake.close()
         return sender
 
     serial_firmware.faults.drops_replies = True

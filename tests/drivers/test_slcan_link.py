@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from patient_config import patient_config
 from slcan_adapter import SlcanAdapter
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
@@ -38,8 +39,7 @@ MOVING = Action(0.5, 0.3)
 
 
 def config_for(adapter: SlcanAdapter, **changes: Any) -> ActuatorConfig:
-    common = {"watchdog_s": 2.0, "latch_s": 30.0, "telemetry_stale_s": 5.0, "telemetry_lost_s": 10.0}
-    return ActuatorConfig(kind="vesc_can", interface="slcan", channel=adapter.port, **(common | changes))
+    return patient_config(kind="vesc_can", interface="slcan", channel=adapter.port, **changes)
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WRITER = """
 import sys, struct, zlib
 from drivers.sender.slots import Slot
-slot = Slot.attach(int(sys.argv[1]), 2048)
+slot = Slot(int(sys.argv[1]), 2048)
 n = 0
 while True:
     n += 1
@@ -54,7 +54,7 @@ def test_incomplete_copy_is_ignored_and_the_previous_copy_read(offset: int) -> N
 def test_attached_writer_continues_the_sequence() -> None:
     slot = Slot.create(16)
     slot.write(b"a")
-    other = Slot.attach(os.dup(slot.descriptor), 16)
+    other = Slot(os.dup(slot.descriptor), 16)
     other.write(b"b")
     assert slot.read() == (2, b"b")
     other.close()

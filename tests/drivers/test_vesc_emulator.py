@@ -16,7 +16,7 @@ from drivers.emulators.faults import WireFaults
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.speed import sender_lateness
-from drivers.vesc.payloads import MotorValues, decode_reply
+from drivers.vesc.payloads import MotorValues, decode_reply, set_current
 from tests.helpers.waiting import until
 
 
@@ -52,9 +52,9 @@ def test_motor_times_out_and_only_motor_commands_reset_its_timer() -> None:
 def test_fault_and_kill_switch_release_the_motor(name: str, value: int) -> None:
     moves: list[tuple[str, float]] = []
     firmware = VescFirmware(CommandLog(), on_motor=lambda t, kind, value: moves.append((kind, value)))
-    firmware.set_motor("current", 1.5, 100.0)
+    firmware.handle(set_current(1.5), 100.0)
     setattr(firmware, name, value)
-    firmware.set_motor("current", 1.5, 100.01)
+    firmware.handle(set_current(1.5), 100.01)
     assert moves == [("current", 1.5), ("release", 0.0)]
     assert [e.value for e in firmware.log.motor()] == [1.5, 1.5], "the log has the commands that arrived"
 

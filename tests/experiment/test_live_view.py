@@ -22,6 +22,7 @@ from carlab.experiment.campaign.figures import predict_ahead
 from carlab.experiment.campaign.live_view import Activity, LiveSettings, LiveView, show
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.rerun.viewer import check_viewer
+from learning.rollouts import StatelessModel
 from tests.helpers.rerun_files import cells, tabs
 from tests.helpers.waiting import until
 
@@ -88,7 +89,7 @@ def test_documents_of_a_drive_reach_a_listener(tmp_path: Path) -> None:
     assert [d.step for d in documents if isinstance(d, Tick)] == recorded == list(range(5))
 
 
-class Drifting:
+class Drifting(StatelessModel):
     """A car that moves by its action along x, and to the left by Gaussian noise of 0.01 m a step."""
 
     history = 0

@@ -12,6 +12,8 @@ import pytest
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Document, EpisodeEnded
+from carlab.core.errors import ConfigError
+from carlab.core.geofence import rectangle
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Observation
@@ -85,6 +87,17 @@ def test_car_stands_still_at_the_start_of_each_episode(tmp_path: Path, by_hand: 
     assert len(placed_by_hand) == (3 if by_hand else 0)
     assert len(car.armed_at_mps) == 3
     assert max(car.armed_at_mps) < 0.1
+
+
+def test_person_is_not_asked_to_place_the_car_outside_the_arena(tmp_path: Path) -> None:
+    with ArmSpeedCar() as car:
+        car.place = lambda state: False  # type: ignore[method-assign]
+        placed_by_hand: list[CarState] = []
+        hooks, envelope = RunHooks(place_by_hand=placed_by_hand.append), SafetyEnvelope(arena_m=rectangle(2, 4, 2, 4))
+        with pytest.raises(ConfigError, match=r"^The start \(1\.\d+, -1\.\d+\) m is outside the arena; enlarge"):
+            make_session(car, Forward(), tmp_path, hooks, envelope).drive(1)
+    assert placed_by_hand == []
+    assert car.armed_at_mps == []
 
 
 def test_waiting_for_standstill_ends_at_the_timeout() -> None:

@@ -16,6 +16,10 @@ def typical(name):
     return {**numbers, **stronger.get(name, {})}
 
 
+ALL_EFFECTS = {name: typical(name) for name in NAMES if name != "tyre_saturation"}
+"""All effects except tyre saturation, which turns a kinematic or linear-tyre car into a dynamic one."""
+
+
 def some(cars=4, ticks=6, seed=0):
     rng = np.random.default_rng(seed)
     start = rng.uniform(-1, 1, (cars, 6)) * [1, 1, 3, 1, 0.3, 1] + [0.5, 0, 0, 1.6, 0, 0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from carlab.core.errors import ActuatorFaultError
-from drivers.links.link import CanFrame, FrameLink, LinkStatistics
+from drivers.links.link import CanFrame, FrameLink
 
 
 class FaultyFrameLink:
@@ -12,7 +12,7 @@ class FaultyFrameLink:
     def __init__(self, link: FrameLink) -> None:
         self.link = link
         self.failure: str | None = None
-        self.statistics: LinkStatistics = link.statistics
+        self.opens = 0
 
     def open(self) -> None:
         """Open the link."""

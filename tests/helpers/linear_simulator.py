@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from learning.evaluation import Mixture
 from learning.networks.normaliser import Normaliser
 from learning.priors.domain_models import uniform
 
@@ -55,3 +56,8 @@ def truth(x):
 
 def tensors(*arrays):
     return [torch.tensor(a, dtype=torch.float32) for a in arrays]
+
+
+def mean_and_scale(prediction: Mixture) -> tuple[Tensor, Tensor]:
+    """Return mean and scale (N, O) of a prediction with one component."""
+    return prediction.means[0], prediction.marginal_scales[0]

@@ -5,10 +5,10 @@ from typing import Any
 from mocap.natnet.descriptions import decode_model_def
 from mocap.natnet.frames import decode_frame
 from mocap.natnet.messages import (
-    Response,
     decode_connect,
     decode_echo_request,
     decode_echo_response,
+    decode_integer_response,
     decode_server_info,
     decode_text,
     split_message,
@@ -27,7 +27,7 @@ def decode_datagram(datagram: bytes, version: BitstreamVersion, *, lenient: bool
         MessageId.SERVERINFO: decode_server_info,
         MessageId.REQUEST: decode_text,
         MessageId.MESSAGESTRING: decode_text,
-        MessageId.RESPONSE: Response,
+        MessageId.RESPONSE: decode_integer_response,
         MessageId.ECHOREQUEST: decode_echo_request,
         MessageId.ECHORESPONSE: decode_echo_response,
     }

@@ -4,10 +4,7 @@ import pytest
 import torch
 
 from learning.networks.adam import Adam
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
+from tests.helpers.seeded import generator
 
 
 def gradients(count, shape=(3, 4)):

@@ -1,7 +1,5 @@
 """Averaging of models by held-out density, against closed forms, quadrature and scipy."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
@@ -23,7 +21,7 @@ class Gaussian:
     def __init__(self, mean, std=1.0):
         self.mean, self.std = mean, std
 
-    def prediction(self, inputs):
+    def predict(self, inputs):
         return Mixture(torch.full((1, len(inputs), 1), self.mean), torch.full((1, 1, 1), self.std))
 
 
@@ -49,7 +47,7 @@ def test_a_model_without_finite_density_has_no_weight():
 
 def test_average_density_and_distribution_function_equal_scipy():
     means, stds, weights = (0.0, 2.0), (1.0, 0.5), (0.3, 0.7)
-    parts = [Gaussian(m, s).prediction(torch.zeros(5, 1)) for m, s in zip(means, stds, strict=True)]
+    parts = [Gaussian(m, s).predict(torch.zeros(5, 1)) for m, s in zip(means, stds, strict=True)]
     average_of_both = WeightedMixture(parts, torch.tensor(weights))
     at = np.linspace(-2.0, 3.0, 5)
     targets = torch.from_numpy(at).float()[:, None]
@@ -82,14 +80,14 @@ def test_average_drops_models_that_the_data_contradict():
 @pytest.mark.slow
 def test_wrong_structure_falls_back_to_other_models(monkeypatch):
     """A detent is outside the structured family: the average is better than the structured simulator alone."""
-    monkeypatch.setattr(averaging, "held_out_log_densities", partial(held_out_log_densities, max_folds=3))
+    monkeypatch.setattr(averaging, "MAX_FOLDS", 3)
     case = CASES["pendulum_detent"].structured()
     data = case.data(10, 100)
     task = FitTask(case, data, 100, None)
     averaged = negative_log_likelihood(task.average().predict(data.test_inputs), data.test_outputs)
     wrong, none = (
         negative_log_likelihood(
-            task.posterior(simulator, data.inputs, data.outputs, size).prediction(data.test_inputs), data.test_outputs
+            task.posterior(simulator, data.inputs, data.outputs, size).predict(data.test_inputs), data.test_outputs
         )
         for simulator, size in ((case.prior, None), (None, PRIOR_FUNCTION))
     )

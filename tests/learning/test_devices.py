@@ -148,8 +148,9 @@ def test_function_posterior_is_equal_on_the_device(device: str, model: DomainMod
     on_device, on_cpu = on_both(lambda at: inferred(model, at), device)
     assert on_device.dof == on_cpu.dof < 10.0, "the branch with outliers must be used"
     assert_close(on_device.noise_std, on_cpu.noise_std)
-    for found, expected in zip(on_device.predict(at.to(device)), on_cpu.predict(at), strict=True):
-        assert_close(found, expected)
+    found, expected = on_device.predict(at.to(device)), on_cpu.predict(at)
+    assert_close(found.means, expected.means)
+    assert_close(found.stds, expected.stds)
     for found, expected in zip(
         on_device.marginals(at.view(4, 3, 4).to(device)), on_cpu.marginals(at.view(4, 3, 4)), strict=True
     ):
@@ -363,7 +364,7 @@ def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytes
         (system_identification, "STEPS", 2),
         (system_identification, "REFINEMENT_STEPS", 2),
         (system_identification, "N_RESTARTS", 2),
-        (averaging, "held_out_log_densities", partial(averaging.held_out_log_densities, max_folds=2)),
+        (averaging, "MAX_FOLDS", 2),
         (discrepancy, "STEPS", 2),
         (parameter_posterior, "RANDOM_WALK_STEPS", 1),
         (parameter_posterior, "MAX_TEMPERING_STEPS", 2),

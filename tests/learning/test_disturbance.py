@@ -19,7 +19,7 @@ from carlab.prediction.learned import sample_paths
 from learning.posterior.sampler import Assignment
 from learning.world import disturbance_fit
 from learning.world.car_dynamics import CarDynamics
-from learning.world.disturbance import DisturbanceProcess, DisturbedCar, start_rollouts
+from learning.world.disturbance import DisturbanceProcess, DisturbedCar
 from learning.world.disturbance_fit import (
     MAX_SCALE,
     fit_disturbance,
@@ -47,7 +47,7 @@ def sampled(model: DisturbedCar | CarDynamics, count: int, steps: int = STEPS) -
     """Return states (count, 6) after rollouts from rest."""
     generator = torch.Generator().manual_seed(0)
     features = encode(torch.zeros(count, 6), torch.zeros(count, 0, 2))
-    rollouts = start_rollouts(model, count, generator)
+    rollouts = model.rollouts(count, generator)
     for _ in range(steps):
         features = rollouts.step(features, torch.zeros(count, 2), generator)
     states: Tensor = decode_state(features)

@@ -8,10 +8,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from learning.priors.domain_models import KinematicCar, Pendulum, Sinusoids, draw_parameters
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
+from tests.helpers.seeded import generator
 
 
 @pytest.mark.parametrize(

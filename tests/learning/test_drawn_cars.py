@@ -10,7 +10,6 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_history, decode_state, encode
-from learning.world.disturbance import start_rollouts
 from learning.world.drawn_cars import HISTORY, WINDOW_TICKS, DrawnCars, draw_cars, select_cars
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
@@ -38,7 +37,7 @@ def test_rollout_tick_by_tick_equals_the_simulator() -> None:
     cars = DrawnCars(CAR, values)
     commands = random_commands(2, 30)
     expected = rollout(CAR, torch.zeros((2, 6)), commands, values=values).states
-    rollouts = start_rollouts(cars, 2, torch.Generator())
+    rollouts = cars.rollouts(2, torch.Generator())
     features = torch.from_numpy(encode(np.zeros((2, 6)), np.zeros((2, HISTORY, 2)))).float()
     for k in range(30):
         features = rollouts.step(features, commands[:, k], torch.Generator())
@@ -56,7 +55,7 @@ def test_rollouts_have_the_past_commands_of_the_caller(history: int) -> None:
     cars = draw_cars(CAR, 4, torch.Generator().manual_seed(0), history)
     commands = random_commands(4, wanted + 1)
     features = torch.from_numpy(encode(np.zeros((4, 6)), commands[:, :wanted].numpy())).float()
-    after = start_rollouts(cars, 4, torch.Generator()).step(features, commands[:, -1], torch.Generator())
+    after = cars.rollouts(4, torch.Generator()).step(features, commands[:, -1], torch.Generator())
     assert after.shape == (4, 7 + 2 * wanted)
     torch.testing.assert_close(decode_history(after), commands[:, 1:])
     expected = rollout(CAR, torch.zeros((4, 6)), commands[:, -1:], history=commands[:, :-1], values=cars.values)

@@ -12,13 +12,10 @@ from learning.evaluation import calibration_error, negative_log_likelihood
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit_fsvgd
 from learning.networks.normaliser import Normaliser
 from learning.priors.function_prior import RbfCovariance
+from tests.helpers.seeded import generator
 
 UNIT = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
 EMPTY = torch.zeros(0, 1)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def lines(x, count=400, seed=0):

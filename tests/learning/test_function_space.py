@@ -11,14 +11,7 @@ from scipy.stats import multivariate_normal
 from learning.networks.particles import LEAKY_RELU_SLOPE, Network
 from learning.priors.function_prior import RbfCovariance, gaussian_process, simulator_marginal
 from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+from tests.helpers.seeded import generator, normal
 
 
 class TestNetwork:

@@ -11,12 +11,9 @@ from learning.networks.normaliser import Normaliser
 from learning.posterior.inference import infer
 from learning.priors.domain_models import Pendulum, draw_parameters
 from learning.priors.motor_pendulum import SLIDING_RADPS, MotorPendulum
+from tests.helpers.seeded import generator
 
 LOSSES = {"frictions": (0.4, 0.6), "drags": (0.4, 0.6), "dry": (0.1, 0.4), "lags": (0.02, 0.06)}
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def state_change(row, drawn):

@@ -15,12 +15,9 @@ from learning.networks.normaliser import Normaliser
 from learning.posterior import parameter_posterior
 from learning.posterior.parameter_posterior import posterior_parameters
 from learning.priors.domain_models import uniform
+from tests.helpers.seeded import generator
 
 PRIOR_MEAN, PRIOR_STD = torch.tensor([1.0, -0.5, 0.2]), torch.tensor([0.5, 2.0, 1.0])
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def features(x):

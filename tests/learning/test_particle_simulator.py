@@ -24,6 +24,7 @@ from learning.priors.simulator_model import CarModel
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import NOISE_STD, car_units, load_car, load_car_arrays, save_car, save_car_arrays
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.seeded import generator
 
 HISTORY, PARTICLES = 2, 6
 GAIN = "motor.drive_gain"
@@ -31,10 +32,6 @@ CAR = SimulatorConfig(kind="kinematic")
 MODEL = CarModel(CAR, HISTORY, {GAIN: (4.0, 12.0), "motor.damping": (1.0, 3.0)}, velocity_delay_s=0.01)
 EXTRA_MPS = 0.05
 """Change of vx in a step that the simulator lacks."""
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def rows(count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
@@ -119,7 +116,7 @@ def test_particles_are_the_simulator_and_the_discrepancy_of_their_draws(
     alone = particles.simulated(normal).mean(dim=0)
     assert float((alone - outputs)[:, 3].abs().mean()) > 0.5 * EXTRA_MPS
     assert float((predicted - outputs)[:, 3].abs().mean()) < 0.3 * EXTRA_MPS
-    mean = posterior.predict(inputs)[0]
+    mean = posterior.predict(inputs).mean
     assert float((predicted - mean)[:, 3].square().mean().sqrt()) < 0.2 * EXTRA_MPS
     assert {tuple(draw.tolist()) for draw in particles.simulator.parameters} <= {
         tuple(draw.tolist()) for draw in posterior.parameters
@@ -207,6 +204,15 @@ def test_file_with_a_damaged_simulator_is_refused(
     np.savez(path, **arrays)
     with pytest.raises(DataError, match=r"car\.npz cannot be read \(.+\); remove its folder to train again\.$"):
         load_car_arrays(path)
+
+
+def test_draws_in_fewer_stored_numbers_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "car.pt"
+    save_car(CarDynamics(random_particles(), HISTORY), path)
+    content = torch.load(path, weights_only=True)
+    torch.save(content | {"simulator_parameters": torch.zeros(1).expand_as(content["simulator_parameters"])}, path)
+    with pytest.raises(DataError, match="simulator_parameters has fewer numbers than its shape"):
+        load_car(path)
 
 
 def test_file_of_networks_alone_has_the_earlier_version(tmp_path: Path) -> None:

@@ -16,10 +16,7 @@ from carlab.studies.regression.study import run_study
 from learning.priors.domain_models import KinematicCar, draw_parameters
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+from tests.helpers.seeded import generator
 
 
 def test_rotated_rows_match_complex_arithmetic() -> None:

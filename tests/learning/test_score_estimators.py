@@ -10,14 +10,11 @@ from learning.functional_svgd.fsvgd import FsvgdSettings, SimulatorPrior, fit_fs
 from learning.functional_svgd.score_estimators import GaussianFit, KernelDensity, NuMethod, SpectralStein
 from learning.networks.normaliser import Normaliser
 from learning.priors.function_prior import RbfCovariance
+from tests.helpers.seeded import normal
 
 ALL = [GaussianFit(), KernelDensity(), SpectralStein(), NuMethod()]
 NAMES = ["gaussian", "kde", "ssge", "nu"]
 every_estimator = pytest.mark.parametrize("estimator", ALL, ids=NAMES)
-
-
-def normal(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def relative_error(estimate, score):

@@ -13,16 +13,13 @@ from learning.baselines import system_identification
 from learning.baselines.system_identification import identify
 from learning.evaluation import negative_log_likelihood
 from learning.priors.domain_models import Pendulum, Sinusoids, draw_parameters
+from tests.helpers.seeded import generator
 
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch):
     for name, value in (("STEPS", 150), ("N_RESTARTS", 8), ("REFINEMENT_STEPS", 40)):
         monkeypatch.setattr(system_identification, name, value)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def pendulum(count, noise, seed=0, **friction):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -15,7 +14,6 @@ from mocap.emulators.scene import RigidBodySample
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
-Until = Callable[[Callable[[], bool]], None]
 
 
 def clock_poses(t_s: float) -> list[RigidBodySample | None]:
@@ -50,16 +48,3 @@ def configure() -> Configure:
         return MocapConfig(**(common | changes))
 
     return config
-
-
-@pytest.fixture
-def until() -> Until:
-    """Wait for a condition; fail after 30 s."""
-
-    def wait(condition: Callable[[], bool]) -> None:
-        deadline_s = time.monotonic() + 30.0
-        while not condition():
-            assert time.monotonic() < deadline_s, "the condition was not met in time"
-            time.sleep(0.01)
-
-    return wait

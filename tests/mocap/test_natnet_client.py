@@ -26,12 +26,12 @@ from mocap.natnet.models import (
     RigidBodyDescription,
 )
 from mocap.natnet_client import NatNetClient
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.realtime
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
-Until = Callable[[Callable[[], bool]], None]
 V30, V40, V41, V42 = (BitstreamVersion(*v) for v in ((3, 0), (4, 0), (4, 1), (4, 2)))
 
 
@@ -95,7 +95,7 @@ def tolerance_s(numbers: Mapping[str, float]) -> float:
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
 def test_client_receives_models_and_frames_of_every_version(
-    serve: Serve, configure: Configure, until: Until, mode: str, version: BitstreamVersion
+    serve: Serve, configure: Configure, mode: str, version: BitstreamVersion
 ) -> None:
     server = serve(mode=mode, version=version)
     received = Received()
@@ -112,7 +112,7 @@ def test_client_receives_models_and_frames_of_every_version(
     assert all(frame.rigid_bodies[0].is_tracked for frame, *_ in received.frames)
 
 
-def test_client_requests_an_older_version_from_a_newer_server(serve: Serve, configure: Configure, until: Until) -> None:
+def test_client_requests_an_older_version_from_a_newer_server(serve: Serve, configure: Configure) -> None:
     server = serve(version="4.1")
     server.version = V42  # it encodes 4.1 and older only: a client of 4.2 would get no frames
     received = Received()
@@ -131,7 +131,7 @@ class RequestOnlyServer(NatNetServer):
         return super()._answer(message_id, payload, address, now_s)
 
 
-def test_bitstream_changes_while_frames_arrive(serve: Serve, configure: Configure, until: Until) -> None:
+def test_bitstream_changes_while_frames_arrive(serve: Serve, configure: Configure) -> None:
     server = serve(kind=RequestOnlyServer, version="4.1", faults=ServerFaults(latency_s=0.05))
     received = Received()
     with NatNetClient(configure(server, bitstream="3.0"), received) as client:
@@ -151,7 +151,7 @@ def short_reconnect_period(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("short_reconnect_period")
-def test_version_is_requested_again_after_a_server_restart(serve: Serve, configure: Configure, until: Until) -> None:
+def test_version_is_requested_again_after_a_server_restart(serve: Serve, configure: Configure) -> None:
     server = serve(kind=RequestOnlyServer, version="4.1", client_timeout_s=0.6)
     received = Received()
     with NatNetClient(configure(server, bitstream="3.0"), received) as client:
@@ -195,7 +195,7 @@ def test_first_frame_of_a_new_version_has_the_changed_flag(serve: Serve) -> None
         assert peer.receive(MessageId.RESPONSE) != bytes(4)
 
 
-def test_clients_of_different_versions_receive_the_same_poses(serve: Serve, configure: Configure, until: Until) -> None:
+def test_clients_of_different_versions_receive_the_same_poses(serve: Serve, configure: Configure) -> None:
     server = serve(version="4.1")
     old, new = Received(), Received()
     with (
@@ -216,7 +216,7 @@ def test_clients_of_different_versions_receive_the_same_poses(serve: Serve, conf
 # -- connection upkeep ----------------------------------------------------------------------------------------------
 
 
-def test_client_without_keepalives_is_dropped(serve: Serve, configure: Configure, until: Until) -> None:
+def test_client_without_keepalives_is_dropped(serve: Serve, configure: Configure) -> None:
     server = serve(client_timeout_s=1.2)
     with Peer(server) as peer, NatNetClient(configure(server)):
         peer.send(MessageId.CONNECT)
@@ -231,7 +231,7 @@ def test_client_without_keepalives_is_dropped(serve: Serve, configure: Configure
     until(lambda: not server.clients)  # close() disconnects
 
 
-def test_changed_models_are_requested_again(serve: Serve, configure: Configure, until: Until) -> None:
+def test_changed_models_are_requested_again(serve: Serve, configure: Configure) -> None:
     server = serve()
     received_models: list[tuple[Any, ...]] = []
     with NatNetClient(configure(server), on_models=received_models.append) as client:
@@ -241,7 +241,7 @@ def test_changed_models_are_requested_again(serve: Serve, configure: Configure, 
     assert [models[0].name for models in (received_models[0], received_models[-1])] == ["car", "lorry"]
 
 
-def test_lost_requests_for_models_are_sent_again(serve: Serve, configure: Configure, until: Until) -> None:
+def test_lost_requests_for_models_are_sent_again(serve: Serve, configure: Configure) -> None:
     server = serve()
     with NatNetClient(configure(server)) as client:
         server.faults = ServerFaults(no_answers=True)
@@ -254,7 +254,7 @@ def test_lost_requests_for_models_are_sent_again(serve: Serve, configure: Config
 
 @pytest.mark.usefixtures("short_reconnect_period")
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
-def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
+def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Configure, mode: str) -> None:
     received = Received()
     server = serve(mode=mode, rate_hz=500.0)
     ports = {"command_port": server.command_port, "data_port": server.data_port}
@@ -275,7 +275,7 @@ def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Config
 
 
 @pytest.mark.usefixtures("short_reconnect_period")
-def test_group_is_joined_again_after_the_adapter_was_removed(serve: Serve, configure: Configure, until: Until) -> None:
+def test_group_is_joined_again_after_the_adapter_was_removed(serve: Serve, configure: Configure) -> None:
     received = Received()
     with NatNetClient(configure(serve(mode="multicast")), received) as client:
         until(lambda: bool(received.frames))
@@ -286,9 +286,7 @@ def test_group_is_joined_again_after_the_adapter_was_removed(serve: Serve, confi
         until(lambda: len(received.frames) > count + 100)
 
 
-def test_clock_step_of_the_server_is_detected_and_no_pose_is_in_the_future(
-    serve: Serve, configure: Configure, until: Until
-) -> None:
+def test_clock_step_of_the_server_is_detected_and_no_pose_is_in_the_future(serve: Serve, configure: Configure) -> None:
     server = serve(faults=ServerFaults(clock_offset_s=10.0))
     received = Received()
     with NatNetClient(configure(server), received) as client:
@@ -304,7 +302,7 @@ def test_clock_step_of_the_server_is_detected_and_no_pose_is_in_the_future(
 
 
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
-def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
+def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, mode: str) -> None:
     server = serve(mode=mode, faults=ServerFaults(clock_offset_s=12345.0, clock_drift_ppm=30.0, jitter_s=0.004))
     received = Received()
     with NatNetClient(configure(server), received) as client:
@@ -320,7 +318,7 @@ def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, 
 # -- faults --------------------------------------------------------------------------------------------------------
 
 
-def test_network_faults_are_tolerated_and_counted(serve: Serve, configure: Configure, until: Until) -> None:
+def test_network_faults_are_tolerated_and_counted(serve: Serve, configure: Configure) -> None:
     server = serve(
         rate_hz=500.0,
         seed=3,
@@ -339,7 +337,7 @@ def test_network_faults_are_tolerated_and_counted(serve: Serve, configure: Confi
         assert frame.rigid_bodies[0].y_m == 0.25
 
 
-def test_foreign_datagrams_are_counted_and_ignored(serve: Serve, configure: Configure, until: Until) -> None:
+def test_foreign_datagrams_are_counted_and_ignored(serve: Serve, configure: Configure) -> None:
     server = serve(rate_hz=30.0)
     received = Received()
     foreign_frame = encode_message(MessageId.FRAMEOFDATA, encode_frame(Frame(10**6), V41))
@@ -356,7 +354,7 @@ def test_foreign_datagrams_are_counted_and_ignored(serve: Serve, configure: Conf
     assert all(frame.frame_number < 10**6 for frame, *_ in received.frames)
 
 
-def test_error_in_a_listener_ends_reception_and_is_stored(serve: Serve, configure: Configure, until: Until) -> None:
+def test_error_in_a_listener_ends_reception_and_is_stored(serve: Serve, configure: Configure) -> None:
     server = serve()
     received = Received()
     errors: list[Exception] = []

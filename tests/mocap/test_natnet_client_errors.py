@@ -16,10 +16,10 @@ from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
 from mocap.natnet.models import BitstreamVersion
 from mocap.natnet_client import NatNetClient
+from tests.helpers.waiting import until
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
-Until = Callable[[Callable[[], bool]], None]
 V40, V42 = BitstreamVersion(4, 0), BitstreamVersion(4, 2)
 
 
@@ -53,14 +53,14 @@ def test_missing_connection_is_reported_with_the_reason(serve: Serve, configure:
     assert "local_interface" in text
 
 
-def test_host_names_are_resolved(serve: Serve, configure: Configure, until: Until) -> None:
+def test_host_names_are_resolved(serve: Serve, configure: Configure) -> None:
     server = serve(host="localhost", mode="multicast")
     config = configure(server, server_address="localhost", local_interface="localhost")
     with NatNetClient(config) as client:
         until(lambda: client.statistics()["frames"] > 0.0)
 
 
-def test_no_open_files_or_threads_remain_after_close(serve: Serve, configure: Configure, until: Until) -> None:
+def test_no_open_files_or_threads_remain_after_close(serve: Serve, configure: Configure) -> None:
     folder = "/proc/self/fd"
     if not os.path.isdir(folder):
         pytest.skip("open files cannot be counted without /proc")
@@ -90,7 +90,7 @@ def test_port_in_use_is_reported(serve: Serve) -> None:
         serve(command_port=used_port)
 
 
-def test_error_in_the_poses_ends_the_server_and_is_stored(serve: Serve, until: Until) -> None:
+def test_error_in_the_poses_ends_the_server_and_is_stored(serve: Serve) -> None:
     def poses(t_s: float) -> list[None]:
         raise RuntimeError("no physics")
 

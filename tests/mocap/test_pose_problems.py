@@ -14,12 +14,12 @@ from mocap.emulators.natnet_server import NatNetServer
 from mocap.natnet.models import BitstreamVersion, MessageId, ServerMode
 from mocap.natnet_client import NatNetClient
 from mocap.rigid_body import RigidBodyPoseSource
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.realtime
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
-Until = Callable[[Callable[[], bool]], None]
 
 
 class ServerWithoutEcho(NatNetServer):
@@ -30,7 +30,7 @@ class ServerWithoutEcho(NatNetServer):
 
 
 @pytest.mark.parametrize("server_mode", [1, 2, 3])
-def test_recorded_take_is_a_problem(serve: Serve, configure: Configure, until: Until, server_mode: int) -> None:
+def test_recorded_take_is_a_problem(serve: Serve, configure: Configure, server_mode: int) -> None:
     server = serve()
     with RigidBodyPoseSource(configure(server)) as source:
         until(lambda: source.client.server_mode == 0)
@@ -50,7 +50,7 @@ def newest(source: RigidBodyPoseSource) -> PoseSample:
     return sample
 
 
-def test_frames_that_have_become_unreadable_are_a_problem(serve: Serve, configure: Configure, until: Until) -> None:
+def test_frames_that_have_become_unreadable_are_a_problem(serve: Serve, configure: Configure) -> None:
     server = serve()
     with RigidBodyPoseSource(configure(server)) as source:
         assert source.problems() == ()
@@ -63,7 +63,7 @@ def test_frames_that_have_become_unreadable_are_a_problem(serve: Serve, configur
         until(lambda: source.problems() == ())
 
 
-def test_late_poses_are_a_problem(serve: Serve, configure: Configure, until: Until) -> None:
+def test_late_poses_are_a_problem(serve: Serve, configure: Configure) -> None:
     server = serve(faults=ServerFaults(latency_s=0.3))
     with RigidBodyPoseSource(configure(server)) as source:
         until(lambda: bool(source.problems()))
@@ -74,7 +74,7 @@ def test_late_poses_are_a_problem(serve: Serve, configure: Configure, until: Unt
         assert source.problems() == ()
 
 
-def test_poses_that_have_become_late_are_a_problem_at_once(serve: Serve, configure: Configure, until: Until) -> None:
+def test_poses_that_have_become_late_are_a_problem_at_once(serve: Serve, configure: Configure) -> None:
     server = serve()
     with RigidBodyPoseSource(configure(server)) as source:
         until(lambda: source.statistics()["frames"] >= 600)

@@ -12,12 +12,12 @@ from mocap.emulators.natnet_server import NatNetServer
 from mocap.emulators.scene import EmulatedBody, RigidBodySample
 from mocap.natnet.models import MessageId
 from mocap.rigid_body import RigidBodyPoseSource
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.realtime
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
-Until = Callable[[Callable[[], bool]], None]
 
 
 class LateModels(NatNetServer):
@@ -32,7 +32,7 @@ class LateModels(NatNetServer):
 
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
 def test_pose_of_another_body_is_not_used_after_a_restart_of_the_server(
-    serve: Serve, configure: Configure, until: Until, monkeypatch: pytest.MonkeyPatch, mode: str
+    serve: Serve, configure: Configure, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     """The server gives the streaming ids anew when it starts."""
     monkeypatch.setattr("mocap.natnet.message_schedule.RECONNECT_PERIOD_S", 0.3)

@@ -25,12 +25,12 @@ from mocap.emulators.scene import EmulatedBody, RigidBodySample
 from mocap.natnet.models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription
 from mocap.natnet.sockets import udp_socket
 from mocap.rigid_body import RigidBodyPoseSource, select_body
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.realtime
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
-Until = Callable[[Callable[[], bool]], None]
 
 # Y up to Z up: a rotation by 90 degrees about x.
 UP = Rotation.from_euler("x", 90, degrees=True)
@@ -97,7 +97,7 @@ def test_pose_of_base_link_includes_yaw_offset_and_pivot(serve: Serve, configure
         assert source.problems() == ()
 
 
-def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Until) -> None:
+def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure) -> None:
     def tilted(t_s: float) -> list[RigidBodySample]:
         return [RigidBodySample(t_s, (0.0, 0.0, 0.5), tuple(Rotation.from_euler("x", 60, degrees=True).as_quat()))]
 
@@ -122,7 +122,7 @@ def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Un
     [(((120.0, 0.0, 30.0), (-100.0, 50.0, 20.0)), (0.0, 0.0, 30.0)), ((), (1200.0, -800.0, 30.0))],
 )
 def test_millimetres_are_reported(
-    serve: Serve, configure: Configure, until: Until, markers_m: Any, position_m: tuple[float, float, float]
+    serve: Serve, configure: Configure, markers_m: Any, position_m: tuple[float, float, float]
 ) -> None:
     server = serve(lambda t_s: [RigidBodySample(t_s, position_m)], bodies=(EmulatedBody("car", 1, markers_m),))
     with RigidBodyPoseSource(configure(server)) as source:
@@ -131,7 +131,7 @@ def test_millimetres_are_reported(
         assert "the server does not seem to stream metres; set its unit of length to metres." in text
 
 
-def test_carried_car_is_no_problem_once_it_stands_level(serve: Serve, configure: Configure, until: Until) -> None:
+def test_carried_car_is_no_problem_once_it_stands_level(serve: Serve, configure: Configure) -> None:
     tilts_deg, height_m, y_m = [60.0], [0.0], [0.0]
 
     def carried(t_s: float) -> list[RigidBodySample]:
@@ -149,7 +149,7 @@ def test_carried_car_is_no_problem_once_it_stands_level(serve: Serve, configure:
 
 
 @pytest.mark.parametrize("version", ["3.0", "4.1"])
-def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, until: Until, version: str) -> None:
+def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, version: str) -> None:
     """The x of a pose encodes its true time of exposure on the host's monotonic clock."""
     server = serve(version=version, faults=ServerFaults(clock_offset_s=-321.0, clock_drift_ppm=30.0, latency_s=0.02))
     before_s = time.monotonic()
@@ -163,7 +163,7 @@ def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, 
     assert all(s.t_receive_s - s.t_capture_s > 0.02 for s in samples)
 
 
-def test_latest_since_and_wait_for_return_new_samples(serve: Serve, configure: Configure, until: Until) -> None:
+def test_latest_since_and_wait_for_return_new_samples(serve: Serve, configure: Configure) -> None:
     source = RigidBodyPoseSource(configure(serve()), max_samples=16)
     assert source.latest() is None
     assert source.since(-1) == ()
@@ -196,7 +196,7 @@ def test_several_threads_can_wait_for_a_pose(serve: Serve, configure: Configure)
     assert all(sample is not None and sample.sequence > 20 for sample in samples)
 
 
-def test_last_pose_is_kept_while_tracking_is_lost(serve: Serve, configure: Configure, until: Until) -> None:
+def test_last_pose_is_kept_while_tracking_is_lost(serve: Serve, configure: Configure) -> None:
     server = serve(standing())
     with RigidBodyPoseSource(configure(server)) as source:
         assert source.latest() is not None
@@ -209,7 +209,7 @@ def test_last_pose_is_kept_while_tracking_is_lost(serve: Serve, configure: Confi
         until(lambda: source.latest().tracked)  # type: ignore[union-attr]
 
 
-def test_invalid_pose_is_not_tracked(serve: Serve, configure: Configure, until: Until) -> None:
+def test_invalid_pose_is_not_tracked(serve: Serve, configure: Configure) -> None:
     quaternion = [(0.0, 0.0, 0.0, 1.0)]
     place = [(1.0, 2.0, 0.0)]
     server = serve(lambda t_s: [RigidBodySample(t_s, place[0], quaternion[0])])
@@ -228,7 +228,7 @@ def test_invalid_pose_is_not_tracked(serve: Serve, configure: Configure, until: 
         assert source.statistics()["unusable"] > count, "past invalid frames stay counted"
 
 
-def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configure: Configure, until: Until) -> None:
+def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configure: Configure) -> None:
     server = serve(standing())
     with RigidBodyPoseSource(configure(server, body="car")) as source:
         server.set_bodies((EmulatedBody("lorry", 5),))
@@ -240,9 +240,7 @@ def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configur
         assert source.problems() == ()
 
 
-def test_body_that_is_added_later_does_not_replace_the_only_one(
-    serve: Serve, configure: Configure, until: Until
-) -> None:
+def test_body_that_is_added_later_does_not_replace_the_only_one(serve: Serve, configure: Configure) -> None:
     servers: list[NatNetServer] = []
 
     def poses(t_s: float) -> Sequence[RigidBodySample]:
@@ -345,7 +343,7 @@ def test_frames_from_another_address_are_named(serve: Serve, configure: Configur
 
 
 def test_failed_receiver_is_reported_as_a_problem(
-    serve: Serve, configure: Configure, until: Until, monkeypatch: pytest.MonkeyPatch
+    serve: Serve, configure: Configure, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def failing_sample(*arguments: object) -> None:
         raise RuntimeError("out of order")

@@ -16,6 +16,7 @@ from carlab.prediction.initial_states import as_recorded, without_curvature_bias
 from carlab.prediction.learned import LearnedModel
 from carlab.prediction.predict import ConstantVelocity, NoChange, PredictiveModel, SimulatorModel, predicted_at
 from carlab.prediction.windows import cut_windows, segments_of, split_segments
+from learning.rollouts import StatelessModel
 from sim_backends import CarParameters, SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
 
@@ -235,7 +236,7 @@ def test_mocap_latency_acts_like_command_delay(even):
     np.testing.assert_allclose(difference, 0.0, atol=1e-5)
 
 
-class SteadyCar:
+class SteadyCar(StatelessModel):
     """A learned car that keeps its body velocities, with noise on its speed."""
 
     history = 2

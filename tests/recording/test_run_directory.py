@@ -27,6 +27,18 @@ def test_new_run_has_its_folders_configuration_and_environment(tmp_path):
     assert RunDirectory.open_existing(run.path).path == run.path
 
 
+def test_interrupted_creation_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the first file and environment.json; without it, the folder would be no run's folder."""
+
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunDirectory, "write_json", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        RunDirectory.create(tmp_path / "runs", "stopped")
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
 def test_runs_of_the_same_second_have_different_folders(tmp_path):
     runs = [RunDirectory.create(tmp_path, "again").path for _ in range(4)]
     assert len(set(runs)) == 4

@@ -15,6 +15,7 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.dynamics.plain_loop import rollout_one_by_one
 from sim_backends.effects import EFFECTS
 from sim_backends.plant import Plant
+from tests.helpers.effect_inputs import ALL_EFFECTS, typical
 from tests.helpers.measured_rollout import measured_rollout
 
 LAGS = {
@@ -73,17 +74,7 @@ def test_float32_stays_close_to_float64():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    "effects",
-    [
-        {},
-        {
-            "steering_lag": {"time_constant": 0.07},
-            "motor_lag": {"time_constant": 0.2},
-            "steering_delay": {"delay": 0.021},
-        },
-    ],
-)
+@pytest.mark.parametrize("effects", [{}, LAGS])
 def test_agrees_with_the_single_car_path_with_history(kind, effects):
     config = SimulatorConfig(kind=kind, effects=effects)
     start, commands = some(3, 20, seed=4)
@@ -108,9 +99,7 @@ def test_batch_equals_single_rollouts_for_each_chunk_size(monkeypatch):
 
 
 def test_compiled_step_agrees_with_operators():
-    config = SimulatorConfig(
-        kind="blend", effects={name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items()}
-    )
+    config = SimulatorConfig(kind="blend", effects={name: typical(name) for name in EFFECTS})
     start, commands = some(7, 12)
     mu = torch.linspace(0.3, 0.5, 7, dtype=torch.float64)
     results = [
@@ -180,17 +169,10 @@ def test_no_autograd_graph_without_a_required_gradient():
         assert rollout(SimulatorConfig(), start, commands).states.grad_fn is None
 
 
-def all_effects():
-    """All effects except tyre saturation, which turns a kinematic or linear-tyre car into a dynamic one."""
-    return {n: {p.name: p.typical for p in e.parameters} for n, e in EFFECTS.items() if n != "tyre_saturation"}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_equal_finite_differences_for_each_number(kind):
-    # These delays do not coincide with changes of the number of steps.
-    delays = {"steering_delay": {"delay": 0.0273}, "throttle_delay": {"delay": 0.0214}}
-    config = SimulatorConfig(kind=kind, effects={**all_effects(), **delays})
+    config = SimulatorConfig(kind=kind, effects=ALL_EFFECTS)
     start, commands = some(2, 4, seed=7)
     history = torch.tensor(np.random.default_rng(2).uniform(-1, 1, (2, 4, 2)))
     names = [n for n in config.values() if n != "timing.control_period" and not n.startswith("mocap.")]
@@ -246,8 +228,7 @@ def without_effects(kind):
 def test_each_effect_of_typical_size_changes_the_measured_states(name, kind):
     """An effect at its identity changes nothing: ``test_effects_everywhere``."""
     (start, commands), plain = some(5, 12), without_effects(kind)
-    typical = {p.name: p.typical for p in EFFECTS[name].parameters}
-    strong = measured_rollout(SimulatorConfig(kind=kind, effects={name: typical}), start, commands)
+    strong = measured_rollout(SimulatorConfig(kind=kind, effects={name: typical(name)}), start, commands)
     assert (plain.measured - strong.measured).abs().max() > 1e-4
     if EFFECTS[name].kind == "observation":
         assert torch.equal(plain.states, strong.states)
@@ -331,7 +312,7 @@ def test_empty_commands_and_commands_of_another_dtype_are_accepted():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_agrees_with_the_cpu():
     start, commands = some(16, 20)
-    config = SimulatorConfig(effects=all_effects())
+    config = SimulatorConfig(effects=ALL_EFFECTS)
     cpu = rollout(config, start, commands).states
     gpu = rollout(config, start.cuda(), commands.cuda()).states
     assert gpu.device.type == "cuda"

@@ -12,11 +12,7 @@ from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.advance import Key
 from sim_backends.compiled.tracing import Tracer, gradients
-from sim_backends.effects import EFFECTS
-
-ALL_EFFECTS = {  # except tyre saturation, which makes a kinematic or linear-tyre car dynamic
-    name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items() if name != "tyre_saturation"
-}
+from tests.helpers.effect_inputs import ALL_EFFECTS
 
 
 def some(cars, ticks):

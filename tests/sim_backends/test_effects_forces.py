@@ -80,13 +80,23 @@ def test_speed_controller_drives_and_brakes_with_limited_force_and_holds_its_spe
     assert near.vx_mps == pytest.approx(1.5 - 0.3 * math.exp(-6.0 / P.mass_kg * 0.4), rel=1e-6)
 
 
-def test_round_controller_has_the_harmonic_limit_at_roundness_one():
-    effects = {"speed_controller": {"forward_force": P.drive_gain_n, "backward_force": 2.0, "roundness": 1.0}}
-    forward = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, 1.0)).state
-    assert forward.vx_mps == pytest.approx(0.5 * P.drive_gain_n / P.mass_kg, rel=1e-9)
-    backward = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, -1.0)).state
-    force = 1.0 / (1.0 / P.drive_gain_n + 1.0 / 2.0)
-    assert backward.vx_mps == pytest.approx(-force / P.mass_kg, rel=1e-9)
+CONTROLLER = {"speed_controller": {"forward_force": P.drive_gain_n, "backward_force": 2.0, "roundness": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("effects", "throttle", "limit"),
+    [
+        (CONTROLLER, 1.0, P.drive_gain_n),
+        (CONTROLLER, -1.0, 2.0),
+        ({"motor_saturation": {"force": P.drive_gain_n, "roundness": 1.0}}, -1.0, P.drive_gain_n),
+        ({"traction_limit": {"share": 0.8, "roundness": 1.0}}, 1.0, 0.8 * P.rear_mu * P.mass_kg * G * 0.13 / 0.3),
+    ],
+)
+def test_round_limit_of_the_force_is_harmonic_at_roundness_one(effects, throttle, limit):
+    """``1 / m = 1 / a + 1 / b``: at full throttle half of the force if the limit is the motor's gain."""
+    state = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, throttle)).state
+    force = 1.0 / (1.0 / P.drive_gain_n + 1.0 / limit)
+    assert state.vx_mps == pytest.approx(throttle * force / P.mass_kg, rel=1e-9)
 
 
 def test_drag_brake_stops_a_coasting_car_in_both_directions_and_ends_with_the_first_throttle():
@@ -102,21 +112,6 @@ def test_drag_brake_stops_a_coasting_car_in_both_directions_and_ends_with_the_fi
         assert drive(cfg, (0, 0, 0, 2.0, 0, 0), (0.0, throttle)).state.vx_mps == pytest.approx(plain.vx_mps, rel=1e-9)
     half = drive(cfg, (0, 0, 0, 2.0, 0, 0), (0.0, 0.025)).state
     assert half.vx_mps == pytest.approx(2.0 + (0.025 * P.drive_gain_n - 0.5 * force) / P.mass_kg, rel=1e-6)
-
-
-def test_round_saturation_is_the_harmonic_limit_at_roundness_one():
-    """``1 / m = 1 / a + 1 / b``: at full throttle half of the force if the limit is the motor's gain."""
-    effects = {"motor_saturation": {"force": P.drive_gain_n, "roundness": 1.0}}
-    state = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, -1.0)).state
-    assert state.vx_mps == pytest.approx(-0.5 * P.drive_gain_n / P.mass_kg, rel=1e-9)
-
-
-def test_round_limit_of_traction_is_the_harmonic_limit_at_roundness_one():
-    full = 0.8 * P.rear_mu * P.mass_kg * G * 0.13 / 0.3
-    effects = {"traction_limit": {"share": 0.8, "roundness": 1.0}}
-    state = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, 1.0)).state
-    force = 1.0 / (1.0 / P.drive_gain_n + 1.0 / full)
-    assert state.vx_mps == pytest.approx(force / P.mass_kg, rel=1e-9)
 
 
 def test_brake_gain_applies_while_braking_only():

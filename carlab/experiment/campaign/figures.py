@@ -20,8 +20,7 @@ from carlab.core.task import Task
 from carlab.experiment.campaign.quick_check import EpisodeCheck
 from carlab.experiment.episodes.result import EpisodeResult
 from carlab.prediction.learned import sample_paths
-from learning.world.car_dynamics import OneStep
-from learning.world.disturbance import RolloutModel, start_rollouts
+from learning.rollouts import RolloutModel
 from learning.world.model_env import policy_inputs
 
 HORIZON_S = 1.0
@@ -189,7 +188,7 @@ class WindowPredictions:
     std: FloatArray
 
 
-def predict_windows(dynamics: OneStep, episode: EpisodeData) -> WindowPredictions:
+def predict_windows(dynamics: RolloutModel, episode: EpisodeData) -> WindowPredictions:
     """Predict consecutive windows of one second by draws of particles and noise; a shorter episode has no window."""
     history = dynamics.history
     length = max(round(HORIZON_S / episode.period_s), 1)
@@ -235,7 +234,7 @@ def predict_ahead(
     """
     generator = torch.Generator().manual_seed(0)
     rows = torch.from_numpy(features).float().repeat_interleave(n_samples, dim=0)
-    rollouts = start_rollouts(dynamics, len(rows), generator)
+    rollouts = dynamics.rollouts(len(rows), generator)
     states = [decode_state(rows)]
     for _ in range(max(round(HORIZON_S / period_s), 1)):
         action = torch.from_numpy(np.clip(act(policy_inputs(rows.numpy())), -1.0, 1.0))

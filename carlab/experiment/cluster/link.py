@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any, Protocol, TextIO
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.errors import ConfigError
+from carlab.core.errors import ConfigError, first_line
 from carlab.core.version import VERSION
 from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
 from carlab.experiment.cluster.order import RESULT_FILES
 from carlab.experiment.cluster.service import TrainingService, sha256
 from carlab.experiment.cluster.settings import LinkSettings
 from carlab.jobs.child_jobs import read_files, write_files
-from carlab.jobs.ray_executor import connect, first_line
+from carlab.jobs.ray_executor import connect
 
 NAMESPACE = "carlab"
 GOODBYE_S = 2.0

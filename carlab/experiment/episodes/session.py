@@ -23,6 +23,7 @@ from carlab.core.clock import SimulatedClock, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, PoseLostError, add_sentence
+from carlab.core.geofence import contains
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy
 from carlab.core.quantities import CarState
@@ -72,7 +73,8 @@ class Session:
 
         Raises:
             SafetyStop: the loop hung and the watchdog thread stopped the car. ConfigError: the task cannot draw a
-                start, or cannot evaluate an episode. Other errors: those of run_episode.
+                start, draws one outside the arena at which a person would place the car, or cannot evaluate an
+                episode. Other errors: those of run_episode.
         """
         results: list[EpisodeResult] = []
         starts = np.random.SeedSequence(self.seed).spawn(episodes)
@@ -83,6 +85,7 @@ class Session:
                 start = _start_of(self.task, np.random.default_rng(starts[index]))
                 if not (self.place and self.car.place(start)):
                     if self.place:
+                        _require_inside(self.envelope, start)
                         interrupts.prompt(functools.partial(self.hooks.place_by_hand, start))
                     if not interrupts.requested.is_set():
                         wait_until_still(self.car)
@@ -189,6 +192,15 @@ class _Emitter:
         if isinstance(document, Tick):
             self.last_tick = document
             self._hooks.on_tick(document)
+
+
+def _require_inside(envelope: SafetyEnvelope, start: CarState) -> None:
+    """Raise ConfigError if a person would have to place the car outside the arena, where each episode ends at once."""
+    if envelope.arena_m and not contains(envelope.arena_m, start.x_m, start.y_m):
+        raise ConfigError(
+            f"The start ({start.x_m:.2f}, {start.y_m:.2f}) m is outside the arena; enlarge the arena (that of the car "
+            "file, else that of the task), or start at the car's current pose (drive: --no-place)."
+        )
 
 
 def _start_of(task: Task, rng: np.random.Generator) -> CarState:

@@ -68,9 +68,6 @@ class Case:
     Attributes:
         name: name on the command line and in the file names of the authors' arrays.
         prior: simulator that the methods know.
-        prior_with_structure: the same simulator with further terms inside its dynamics, which ``--structure`` gives to
-            all methods; None: there is none.
-        truth: simulator that generates the data, with a distribution of its parameters; None: the authors' arrays only.
         counts: numbers of training rows.
         noise_std: standard deviation of the measurement noise of the outputs (O,).
         likelihood_std: initial standard deviation of the noise in the authors' fits (O,).
@@ -80,6 +77,9 @@ class Case:
         discrepancy_std: standard deviation of the authors' discrepancy process (O,); None: the simulator is exact.
         discrepancy_lengthscale: lengthscale of that process on raw inputs.
         function_lengthscale: lengthscale of the Gaussian-process prior of FSVGD on normalised inputs.
+        prior_with_structure: the same simulator with further terms inside its dynamics, which ``--structure`` gives to
+            all methods; None: there is none.
+        truth: simulator that generates the data, with a distribution of its parameters; None: the authors' arrays only.
         prior_discrepancy: prior size of carlab's discrepancy, in units of the outputs; None: the simulator is exact.
         body_frame: the same case in the body frame for all methods but those of the paper; None: the same coordinates.
         in_body_frame: whether rows are transformed to the car's frame at the start of the step.
@@ -88,8 +88,6 @@ class Case:
 
     name: str
     prior: DomainModel
-    prior_with_structure: DomainModel | None
-    truth: DomainModel | None
     counts: tuple[int, ...]
     noise_std: tuple[float, ...]
     likelihood_std: tuple[float, ...]
@@ -99,6 +97,8 @@ class Case:
     discrepancy_std: tuple[float, ...] | None
     discrepancy_lengthscale: float
     function_lengthscale: float
+    prior_with_structure: DomainModel | None = None
+    truth: DomainModel | None = None
     prior_discrepancy: float | None = 0.3
     body_frame: Case | None = None
     in_body_frame: bool = False
@@ -245,8 +245,6 @@ KINEMATIC_RANGES = {
 _RACECAR_WORLD_FRAME = Case(
     name="racecar",
     prior=KinematicCar(place_m=4.0, speed_mps=6.0, rate_radps=8.0),
-    prior_with_structure=None,
-    truth=None,
     counts=(20, 50, 100, 200, 400),
     noise_std=_CAR_NOISE,
     likelihood_std=tuple(20.0 * s for s in _CAR_NOISE),
@@ -304,7 +302,6 @@ CASES = {
         Case(
             name="1d",
             prior=Sinusoids(),
-            prior_with_structure=None,
             truth=Sinusoids(),
             counts=(2,),
             noise_std=(0.0,),
@@ -323,7 +320,6 @@ CASES = {
         Case(
             name="car",
             prior=CarModel(KINEMATIC, CAR_HISTORY, KINEMATIC_RANGES),
-            prior_with_structure=None,
             truth=CarModel(PACEJKA, CAR_HISTORY, PACEJKA_RANGES),
             counts=(20, 50, 100, 200, 400),
             noise_std=(0.001, 0.001, 0.002, 0.008, 0.008, 0.04),

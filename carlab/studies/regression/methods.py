@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from carlab.studies.regression.cases import Case, Data
 from learning.baselines.ensemble import deep_ensemble
 from learning.baselines.ridge import Ridge
 from learning.baselines.system_identification import GreyBox, IdentifiedSimulator, identify
-from learning.evaluation import Mixture, Prediction
+from learning.evaluation import Mixture, Predictor
 from learning.functional_svgd.estimated_prior import EstimatedPrior
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit_fsvgd
 from learning.functional_svgd.score_estimators import KernelDensity, NuMethod, ScoreEstimator, SpectralStein
@@ -45,14 +44,6 @@ PRIOR_DRAWS = 2048
 NOISE_ROWS = 2.0
 Size = float | tuple[float, ...] | None
 """Prior size of a discrepancy in units of the outputs; None: no discrepancy."""
-
-
-class Model(Protocol):
-    """A fitted method."""
-
-    def predict(self, inputs: Tensor) -> Prediction:
-        """Prediction at inputs (N, D)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +160,7 @@ class FitTask:
         """Prior size of the simulator's discrepancy."""
         return self.case.prior_discrepancy_for(len(self.data.inputs))
 
-    def average(self) -> Model:
+    def average(self) -> Predictor:
         """The simulators with and without discrepancy, and no simulator, averaged by held-out density."""
         case = self.case
         candidates: list[tuple[DomainModel | None, Size]] = [(case.prior, None), (None, PRIOR_FUNCTION)]
@@ -184,7 +175,7 @@ class FitTask:
 
     def sim_fsvgd(
         self, *, corrected: bool = False, estimator: ScoreEstimator | None = None, with_discrepancy: bool = True
-    ) -> Model:
+    ) -> Predictor:
         """The paper's Sim-FSVGD.
 
         Args:
@@ -203,7 +194,7 @@ class FitTask:
         settings = self.authors_settings(with_simulator=True, corrected=corrected)
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
-    def fsvgd(self, *, corrected: bool) -> Model:
+    def fsvgd(self, *, corrected: bool) -> Predictor:
         """The paper's FSVGD: a Gaussian-process prior of one normalised unit."""
         case, normaliser, pool = self.case, self.normaliser, self.pool()
         covariance = RbfCovariance((1.0,) * len(case.output_std), (case.function_lengthscale,))
@@ -215,23 +206,24 @@ class FitTask:
         """SysID: the simulator at its maximum-likelihood parameters."""
         return identify(self.case.prior, self.data.inputs, self.data.outputs, self.noise_std, self.seed)
 
-    def grey_box(self) -> Model:
+    def grey_box(self) -> Predictor:
         """GreyBox: SysID, and particles for its residual."""
         simulator = self.sysid()
         with torch.no_grad():
             residual = self.data.outputs - simulator.mean(self.data.inputs)
-        return GreyBox(simulator, self.distilled(None, residual, self.discrepancy_size or MIN_DISCREPANCY))
+        particles = self.distilled(None, residual, self.discrepancy_size or MIN_DISCREPANCY)
+        return GreyBox(simulator, particles.predict)
 
-    def ensemble(self) -> Model:
+    def ensemble(self) -> Predictor:
         """Deep ensemble."""
         return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, self.network_settings())
 
-    def ridge(self) -> Model:
+    def ridge(self) -> Predictor:
         """Ridge regression."""
         return _Linear(Ridge.fit(*(v.cpu().double().numpy() for v in (self.data.inputs, self.data.outputs))))
 
 
-METHODS: dict[str, Callable[[FitTask], Model]] = {
+METHODS: dict[str, Callable[[FitTask], Predictor]] = {
     "gp-sim-average": FitTask.average,
     "gp-sim-posterior": lambda task: task.distilled(task.case.prior, task.data.outputs, task.discrepancy_size),
     "sim-posterior": lambda task: task.distilled(task.case.prior, task.data.outputs, None),
@@ -246,7 +238,7 @@ METHODS: dict[str, Callable[[FitTask], Model]] = {
     "ridge": FitTask.ridge,
 }
 """Methods by their name in tables and on the command line; ``sim-posterior`` has no model discrepancy."""
-VARIANTS: dict[str, Callable[[FitTask], Model]] = {
+VARIANTS: dict[str, Callable[[FitTask], Predictor]] = {
     "sim-fsvgd-kde": lambda task: task.sim_fsvgd(estimator=KernelDensity()),
     "sim-fsvgd-ssge": lambda task: task.sim_fsvgd(estimator=SpectralStein(from_normal=True)),
     "sim-fsvgd-nu": lambda task: task.sim_fsvgd(estimator=NuMethod(from_normal=True)),

@@ -99,8 +99,6 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
     return RecordedCase(
         name=NAME,
         prior=prior,
-        prior_with_structure=None,
-        truth=None,
         counts=COUNTS,
         noise_std=tuple(0.5 * n for n in NOISE_STD),
         likelihood_std=tuple(0.5 * s for s in output_std),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.errors import ConfigError, DataError
+from carlab.core.errors import ConfigError, DataError, first_line
 from carlab.studies.regression.cases import CASES, Case, Data
 from carlab.studies.regression.methods import METHODS, PAPER_METHODS, VARIANTS, FitTask
 from carlab.studies.regression.scores import Score, failed_score
@@ -175,10 +175,10 @@ def scored(case: Case, data: Data, count: int, seed: int, method: str, *, steps:
 
 def _failure_reason(error: Exception) -> str | None:
     """Why a fit failed; None for a programming error, which ends the study."""
-    reason = next(iter(str(error).splitlines()), "") or type(error).__name__
-    if isinstance(error, (DataError, np.linalg.LinAlgError)):
-        return reason
-    return reason if any(name in str(error).lower() for name in _LINEAR_ALGEBRA) else None
+    is_failed_fit = isinstance(error, (DataError, np.linalg.LinAlgError)) or any(
+        name in str(error).lower() for name in _LINEAR_ALGEBRA
+    )
+    return first_line(error) if is_failed_fit else None
 
 
 def _nll_in_world(prediction: Prediction, data: Data) -> float | None:
