@@ -51,7 +51,7 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "traction_limit": (Physics("yes", "F_x saturates at p_dx1 F_z of the driven rear wheels (tire_model.py)"),),
     "speed_controller": (Physics("similar", "no controller; F_x of the rear wheels is limited in both directions"),),
     "drag_brake": (Physics("no", "without throttle the requested acceleration is zero"),),
-    "all_wheel_drive": (Physics("similar", "brake torque goes to the front (66 %), engine torque to the rear (T_se = 0)"),),
+    "all_wheel_drive": (Physics("similar", "66 % of the brake torque goes to the front, no engine torque (T_se = 0)"),),
     "brake_asymmetry": (Physics("yes", "engine torque goes to the rear (T_se = 0), brake torque 66 % to the front"),),
     "battery_sag": (Physics("no", "nothing depends on time"),),
     "rolling_resistance": (_NO_DRAG,),

@@ -27,8 +27,8 @@ class Instant:
 
     Stages: ``steer`` (front wheel angle d), ``throttle`` (u), ``drive`` (drive force), ``load`` (axle loads), ``grip``
     (mu), ``limit`` (fx, the force of the driven axles; fx_f, its part at the front wheels), ``tyre`` (lateral axle
-    forces), ``body`` (push_x, push_y [N] in the body frame and moment [N m]). Angles are in rad, velocities in m/s and rad/s, forces and loads in N. Hidden
-    states of hooks are ``extra``, their rates go to ``rates``.
+    forces), ``body`` (push_x, push_y [N] in the body frame and moment [N m]). Angles are in rad, velocities in m/s and
+    rad/s, forces and loads in N. Hidden states of hooks are ``extra``, their rates go to ``rates``.
     """
 
     t: float

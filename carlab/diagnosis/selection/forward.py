@@ -20,6 +20,7 @@ from carlab.diagnosis.selection.candidates import accepted, next_candidates
 from carlab.diagnosis.selection.moves import apply_moves
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_with_scale
+from carlab.diagnosis.selection.restarts import restart
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +57,21 @@ class Path:
 def extend(
     problem: SearchProblem, path: Path, control: RunControl, visited: AbstractSet[frozenset[str]] = frozenset()
 ) -> Path:
-    """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets."""
+    """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets.
+
+    Then its fit is restarted. From a lower minimum, the path continues.
+    """
+    while True:
+        path = _with_accepted(problem, path, control, visited)
+        model = path.model if _effects(path) in visited else restart(problem, path.model, control)
+        if model is path.model:
+            return path
+        path = replace(path, model=apply_moves(problem, model, control))
+
+
+def _with_accepted(
+    problem: SearchProblem, path: Path, control: RunControl, visited: AbstractSet[frozenset[str]]
+) -> Path:
     max_effects = problem.settings.selection.max_effects
     while len(path.model.effects) < max_effects and _effects(path) not in visited and not control.ends_search():
         count = len(path.model.effects)

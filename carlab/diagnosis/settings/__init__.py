@@ -16,7 +16,7 @@ from carlab.diagnosis.settings.evidence import EvidenceSettings, UnexplainedSett
 from carlab.diagnosis.settings.prediction import CurveSettings, IdentificationSettings, WindowSettings
 from carlab.diagnosis.settings.quick import QuickSettings
 from carlab.diagnosis.settings.report import ReportSettings
-from carlab.diagnosis.settings.selection import RivalSettings, ScreeningSettings, SelectionSettings
+from carlab.diagnosis.settings.selection import RestartSettings, RivalSettings, ScreeningSettings, SelectionSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,7 @@ EVIDENCE = EvidenceSettings()
 IDENTIFICATION = IdentificationSettings()
 QUICK = QuickSettings()
 REPORT = ReportSettings()
+RESTARTS = RestartSettings()
 SCREENING = ScreeningSettings()
 UNEXPLAINED = UnexplainedSettings()
 """Settings that are the same in every diagnosis, check and comparison."""
@@ -52,6 +53,7 @@ __all__ = [
     "IDENTIFICATION",
     "QUICK",
     "REPORT",
+    "RESTARTS",
     "SCREENING",
     "UNEXPLAINED",
     "CurveSettings",
