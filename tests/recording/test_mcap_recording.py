@@ -270,7 +270,7 @@ def test_episode_without_a_tick_is_refused_with_its_end_reason(tmp_path, make_do
     started = make_documents(1)[0]
     ended = EpisodeEnded(started.t_s, EndReason.CRASHED, "No pose came.", 0, 0.0)
     path = record(tmp_path / "0001.mcap", [started, ended])
-    assert read_recording(path).recovered is False
+    assert read_recording(path).defect is None
     with pytest.raises(DataError, match=r"0001\.mcap holds no complete tick .*No pose came"):
         read_episode(path)
 
