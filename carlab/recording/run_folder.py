@@ -54,16 +54,13 @@ class RunDirectory:
     path: Path
 
     @classmethod
-    def create(
-        cls, root: Path | str, name: str, *, config_toml: str = "", metadata: Mapping[str, str] | None = None
-    ) -> Self:
+    def create(cls, root: Path | str, name: str, *, config_toml: str = "") -> Self:
         """Create ``root/<date>_<time>_<name>`` with the folder of its episodes, its configuration and environment.
 
         Args:
             root: Folder of all runs, usually ``runs``.
             name: Name of the run; characters that are invalid in file names become ``-``.
             config_toml: The car file of the run.
-            metadata: Further facts for environment.json.
 
         Raises:
             DataError: The folder cannot be written.
@@ -82,7 +79,7 @@ class RunDirectory:
             run = cls(path)
             run.episodes.mkdir()
             (path / "config.toml").write_text(config_toml, encoding="utf-8")
-            run.write_json("environment.json", {**environment(), **(metadata or {})})
+            run.write_json("environment.json", environment())
         return run
 
     @classmethod
@@ -189,10 +186,6 @@ class RunDirectory:
             return [row for row in rows if isinstance(row, dict) and type(row.get("episode")) is int]
         except (OSError, ValueError, KeyError, TypeError):
             return []
-
-    def write_result(self, result: Mapping[str, Any]) -> None:
-        """Write result.json. Raises DataError if that fails."""
-        self.write_json(RESULT_FILE, result)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file atomically. Raises DataError if that fails."""
