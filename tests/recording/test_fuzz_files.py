@@ -4,10 +4,9 @@ Cases are drawn with a fixed seed; the file name in a message contains the numbe
 """
 
 import gzip
-import importlib.util
 import json
-from pathlib import Path
 
+import foreign_drive as foreign
 import numpy as np
 import pytest
 from mcap.writer import Writer
@@ -19,10 +18,6 @@ from carlab.recording.mcap.messages import ended_to_metadata, started_to_metadat
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.recorder import Recorder
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
 
 CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "true", "x", '"', "9" * 400, "\x00", "1,2", "0x1f"]
 JSON_TEXTS = ["", "null", "3", "[]", "[1]", "{}", '"a"', "[[1]]", "[[1, 2, 3]]", "[null, 1, 2]", "[" * 100_000, "nan"]
