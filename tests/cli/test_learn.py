@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
 import json
 import math
 import shutil
@@ -20,22 +18,12 @@ import torch
 
 import carlab.cars as carlab_cars
 from carlab.api import learning
-from carlab.cli import run
 from carlab.experiment.campaign.training import TrainingRequest
 from carlab.recording.mcap.source import read_episode
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab, run_command
 
 TICKS = 20
 TINY = ("--ticks", TICKS, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun")
-
-
-def run_command(*argv: object) -> tuple[int, str]:
-    """Exit code of a valid command line, and its output on one line."""
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
-        code = run([str(a) for a in argv])
-    return code, " ".join(out.getvalue().split())
 
 
 @pytest.fixture(scope="module", autouse=True)
