@@ -78,7 +78,26 @@ class FunctionWorkers:
         """
         results: list[Result | None] = [None] * len(arguments)
         pending = deque(range(len(arguments)))
-        threads = self._start_sharing(function, arguments, pending, results)
+        failed: list[int] = []
+
+        def share(child: _Child) -> None:
+            """Hand pending calls to a child until none is left, or until one fails, which is pending again."""
+            while (index := _next(pending)) is not None:
+                try:
+                    child.connection.send((function, arguments[index]))
+                    results[index] = child.connection.recv()
+                except Exception as error:  # whatever it is, the parent makes this call again, or raises the same error
+                    log.info("a call in a child process failed (%s: %s)", type(error).__name__, error)
+                    failed.append(index)
+                    pending.append(index)
+                    return
+
+        children = self._started_children() if len(arguments) > 1 and not self._child_failed else []
+        threads = [
+            threading.Thread(target=share, args=(child,), name="function worker", daemon=True) for child in children
+        ]
+        for thread in threads:
+            thread.start()
         try:
             while pending or any(thread.is_alive() for thread in threads):
                 if pending and stop():
@@ -97,7 +116,7 @@ class FunctionWorkers:
         finally:
             for thread in threads:
                 thread.join()
-        self._child_failed = self._child_failed or any(thread.failed for thread in threads)
+        self._child_failed = self._child_failed or bool(failed)
         return results
 
     def close(self) -> None:
@@ -106,21 +125,10 @@ class FunctionWorkers:
             child.kill()
         self._children = []
 
-    def _start_sharing(
-        self,
-        function: Callable[..., Result],
-        arguments: Sequence[tuple[Any, ...]],
-        pending: deque[int],
-        results: list[Result | None],
-    ) -> list[_Sharing]:
-        if len(arguments) < 2 or self._child_failed:
-            return []
+    def _started_children(self) -> list[_Child]:
         while len(self._children) < self.processes - 1:
             self._children.append(_Child())
-        threads = [_Sharing(child, function, arguments, pending, results) for child in self._children]
-        for thread in threads:
-            thread.start()
-        return threads
+        return self._children
 
 
 class _Child:
@@ -141,34 +149,6 @@ class _Child:
         self._process.kill()
         self._process.wait()
         self.connection.close()
-
-
-class _Sharing(threading.Thread):
-    """Hands pending calls to a child until none is left, or until one fails, which is pending again."""
-
-    def __init__(
-        self,
-        child: _Child,
-        function: Callable[..., Any],
-        arguments: Sequence[tuple[Any, ...]],
-        pending: deque[int],
-        results: list[Any],
-    ) -> None:
-        super().__init__(name="function worker", daemon=True)
-        self.child, self.function, self.arguments = child, function, arguments
-        self.pending, self.results = pending, results
-        self.failed = False
-
-    def run(self) -> None:
-        while (index := _next(self.pending)) is not None:
-            try:
-                self.child.connection.send((self.function, self.arguments[index]))
-                self.results[index] = self.child.connection.recv()
-            except Exception as error:  # whatever it is, the parent makes this call again, or raises the same error
-                log.info("a call in a child process failed (%s: %s)", type(error).__name__, error)
-                self.failed = True
-                self.pending.append(index)
-                return
 
 
 def _next(pending: deque[int]) -> int | None:
