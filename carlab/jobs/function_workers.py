@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, Pipe
-from typing import Any, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -76,48 +76,34 @@ class FunctionWorkers:
         Returns:
             The results in the order of the arguments; None for calls that did not begin.
         """
-        results: list[Result | None] = [None] * len(arguments)
-        pending = deque(range(len(arguments)))
-        failed: list[int] = []
-
-        def share(child: _Child) -> None:
-            """Hand pending calls to a child until none is left, or until one fails, which is pending again."""
-            while (index := _next(pending)) is not None:
-                try:
-                    child.connection.send((function, arguments[index]))
-                    results[index] = child.connection.recv()
-                except Exception as error:  # whatever it is, the parent makes this call again, or raises the same error
-                    log.info("a call in a child process failed (%s: %s)", type(error).__name__, error)
-                    failed.append(index)
-                    pending.append(index)
-                    return
-
+        calls = _Calls(function, arguments)
         children = self._started_children() if len(arguments) > 1 and not self._child_failed else []
         threads = [
-            threading.Thread(target=share, args=(child,), name="function worker", daemon=True) for child in children
+            threading.Thread(target=calls.make_in, args=(child,), name="function worker", daemon=True)
+            for child in children
         ]
         for thread in threads:
             thread.start()
         try:
-            while pending or any(thread.is_alive() for thread in threads):
-                if pending and stop():
-                    pending.clear()
-                index = _next(pending)
+            while calls.pending or any(thread.is_alive() for thread in threads):
+                if calls.pending and stop():
+                    calls.pending.clear()
+                index = calls.next()
                 if index is None:  # all calls have begun; one that fails in a child becomes pending again
                     for thread in threads:
                         thread.join()
                     continue
                 started(index)
-                results[index] = function(*arguments[index])
+                calls.results[index] = function(*arguments[index])
         except BaseException:
-            pending.clear()
+            calls.pending.clear()
             self.close()  # ends the calls of the children
             raise
         finally:
             for thread in threads:
                 thread.join()
-        self._child_failed = self._child_failed or bool(failed)
-        return results
+        self._child_failed = self._child_failed or calls.child_failed
+        return calls.results
 
     def close(self) -> None:
         """End the children; a later ``map`` starts new ones."""
@@ -151,11 +137,33 @@ class _Child:
         self.connection.close()
 
 
-def _next(pending: deque[int]) -> int | None:
-    try:
-        return pending.popleft()
-    except IndexError:
-        return None
+class _Calls(Generic[Result]):
+    """Calls that this process and its children share."""
+
+    def __init__(self, function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]]) -> None:
+        self.function, self.arguments = function, arguments
+        self.pending = deque(range(len(arguments)))
+        self.results: list[Result | None] = [None] * len(arguments)
+        self.child_failed = False
+
+    def next(self) -> int | None:
+        """Index of the next call, which is then no longer pending; None if none is left."""
+        try:
+            return self.pending.popleft()
+        except IndexError:
+            return None
+
+    def make_in(self, child: _Child) -> None:
+        """Hand pending calls to a child until none is left, or until one fails, which is pending again."""
+        while (index := self.next()) is not None:
+            try:
+                child.connection.send((self.function, self.arguments[index]))
+                self.results[index] = child.connection.recv()
+            except Exception as error:  # whatever it is, the parent makes this call again, or raises the same error
+                log.info("a call in a child process failed (%s: %s)", type(error).__name__, error)
+                self.child_failed = True
+                self.pending.append(index)
+                return
 
 
 def serve(connection: Connection) -> None:
