@@ -322,7 +322,7 @@ def _without_arena(policy: str | Policy, task: Task, choice: CarChoice) -> Task:
 
 def _envelope(car_limits: SafetyEnvelope, task: Task, max_throttle: float | None) -> SafetyEnvelope:
     """The car's limits; the task's arena if the car has no arena."""
-    limits = car_limits if car_limits.arena_m else replace(car_limits, arena_m=task.arena_m)
+    limits = car_limits.with_default_arena(task.arena_m)
     return limits if max_throttle is None else replace(limits, max_throttle=max_throttle)
 
 

@@ -187,11 +187,11 @@ def _read_csv(path: Path, mapping: Any, latency_s: float, loaded: LoadedRecordin
     from carlab.recording.csv.repairing_import import import_repaired
 
     read = import_repaired(path, mapping=mapping)
-    loaded.episodes += [align_states(episode, latency_s) for episode in read.imported.episodes]
-    loaded.notes.append(read.imported.announcement)
-    repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
+    loaded.episodes += [align_states(episode, latency_s) for episode in read.episodes]
+    loaded.notes.append(read.announcement)
+    repaired = [f for f in read.report.findings if f.severity is Severity.REPAIRED]
     left_out = [f for f in repaired if f.id in LEFT_OUT_ROWS]
-    rows = read.imported.episodes[-1].ticks + 1
+    rows = read.episodes[-1].ticks + 1
     loaded.faults += [
         DataFault(f.id, f.channel, f.count or rows, f"repaired: {f.sentence}")
         for f in (*(f for f in (*read.repaired, *repaired) if f.id in REPORTED_FAULTS), *left_out)

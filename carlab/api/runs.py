@@ -164,10 +164,12 @@ def viewer_connection(live: bool, viewer: str | None) -> Callable[[RecordingStre
         NotReadyError: no viewer can be opened here, or none listens at the address.
     """
     if viewer is not None:
-        from carlab.recording.rerun.viewer import check_viewer, connect_to_viewer
+        from rerun import RecordingStream
+
+        from carlab.recording.rerun.viewer import check_viewer
 
         check_viewer(viewer)
-        return functools.partial(connect_to_viewer, address=viewer)
+        return functools.partial(RecordingStream.connect_grpc, url=viewer)
     if not live:
         return None
     from carlab.recording.rerun.viewer import open_viewer
@@ -199,6 +201,8 @@ def collecting(hooks: RunHooks, run: RunDirectory, results: list[EpisodeResult])
 
 def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
     """Write result.json: end reason and figures of each episode, also of the earlier episodes of a resumed run."""
+    from carlab.recording.run_folder import RESULT_FILE
+
     now = {result.episode for result in results}
     episodes = [row for row in run.result_rows if row["episode"] not in now] + [
         {
@@ -212,7 +216,7 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
         for result in results
     ]
     episodes.sort(key=lambda row: int(row["episode"]))
-    run.write_result({"end_reason": episodes[-1].get("end_reason"), "episodes": episodes})
+    run.write_json(RESULT_FILE, {"end_reason": episodes[-1].get("end_reason"), "episodes": episodes})
 
 
 def figure_names(results: Sequence[EpisodeResult]) -> list[str]:

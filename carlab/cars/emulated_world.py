@@ -172,9 +172,7 @@ class World:
 
     def wait_for_motor_timeout(self) -> None:
         """Wait until the firmware's time-out has released the motor, like real hardware."""
-        deadline_s = self.clock.now_s() + self.config.motor_timeout_s + WAIT_AFTER_TIMEOUT_S
-        while self.clock.now_s() < deadline_s:
-            self.clock.sleep_until(self.clock.now_s() + 0.05)
+        self.clock.sleep_until(self.clock.now_s() + self.config.motor_timeout_s + WAIT_AFTER_TIMEOUT_S)
 
     def _on_motor(self, t_s: float, kind: str, value: float) -> None:
         throttle = 0.0

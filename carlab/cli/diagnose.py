@@ -78,11 +78,9 @@ class Diagnose:
             faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in diagnosis.data_faults)
             console.print(f"Faults of the recordings (listed in the report): {', '.join(faults)}.")
         console.print(diagnosis.sentence)
-        for effect in diagnosis.effects:
-            console.print(f"  {effect.sentence}")
-        for sentence in (*curve_sentences(diagnosis), ceiling_sentence(diagnosis), *drift_sentences(diagnosis)):
-            console.print(f"  {sentence}" if sentence else "", end="\n" if sentence else "")
-        for sentence in diagnosed_event_sentences(diagnosis):
+        sentences = [effect.sentence for effect in diagnosis.effects] + curve_sentences(diagnosis)
+        sentences += [ceiling_sentence(diagnosis), *drift_sentences(diagnosis), *diagnosed_event_sentences(diagnosis)]
+        for sentence in filter(None, sentences):
             console.print(f"  {sentence}")
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", shown_errors(diagnosis))
         if not self.curves and (advice := curves_advice(diagnosis)):

@@ -53,11 +53,6 @@ def wall_clock_ns() -> int:
     return time.time_ns()
 
 
-def monotonic_ns() -> int:
-    """Host monotonic time [ns]."""
-    return time.monotonic_ns()
-
-
 @dataclass(frozen=True, slots=True)
 class TickTiming:
     """Deadline and lateness of a tick on the pacer's clock, and the number of skipped deadlines."""
@@ -98,9 +93,7 @@ class Pacer:
 
     def statistics_ms(self) -> dict[str, float]:
         """Lateness percentiles [ms] and the count of skipped ticks."""
-        if not self.late_s:
-            return {"late_p50_ms": 0.0, "late_p99_ms": 0.0, "late_max_ms": 0.0, "skipped": 0.0}
-        p50, p99, top = np.percentile(self.late_s, [50, 99, 100]) * 1e3
+        p50, p99, top = np.percentile(self.late_s or [0.0], [50, 99, 100]) * 1e3
         return {
             "late_p50_ms": float(p50),
             "late_p99_ms": float(p99),

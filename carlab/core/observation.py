@@ -7,7 +7,6 @@ arXiv 2403.16644). The row after tick t ends in the action sent at t.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -68,11 +67,9 @@ class ActionHistory:
     def __init__(self, length: int) -> None:
         self._rows: FloatArray = np.zeros((length, ACTION_SIZE))
 
-    def reset(self, actions: Iterable[Action] = ()) -> None:
-        """Reset to neutral, then push ``actions``."""
+    def reset(self) -> None:
+        """Reset to neutral."""
         self._rows = np.zeros_like(self._rows)
-        for action in actions:
-            self.push(action)
 
     def push(self, action: Action) -> None:
         """Append the action that was sent."""

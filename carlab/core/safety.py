@@ -85,6 +85,10 @@ class SafetyEnvelope:
         if self.lost_pose_s < self.stale_pose_s:
             raise ConfigError("lost_pose_s must not be shorter than stale_pose_s.")
 
+    def with_default_arena(self, arena_m: tuple[tuple[float, float], ...]) -> SafetyEnvelope:
+        """These limits, with another arena if they have none."""
+        return self if self.arena_m else replace(self, arena_m=arena_m)
+
 
 def clip(value: float, limit: float) -> float:
     """Clip to [-limit, limit]."""

@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, Pipe
-from typing import Any, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -76,29 +76,34 @@ class FunctionWorkers:
         Returns:
             The results in the order of the arguments; None for calls that did not begin.
         """
-        results: list[Result | None] = [None] * len(arguments)
-        pending = deque(range(len(arguments)))
-        threads = self._start_sharing(function, arguments, pending, results)
+        calls = _Calls(function, arguments)
+        children = self._started_children() if len(arguments) > 1 and not self._child_failed else []
+        threads = [
+            threading.Thread(target=calls.make_in, args=(child,), name="function worker", daemon=True)
+            for child in children
+        ]
+        for thread in threads:
+            thread.start()
         try:
-            while pending or any(thread.is_alive() for thread in threads):
-                if pending and stop():
-                    pending.clear()
-                index = _next(pending)
+            while calls.pending or any(thread.is_alive() for thread in threads):
+                if calls.pending and stop():
+                    calls.pending.clear()
+                index = calls.next()
                 if index is None:  # all calls have begun; one that fails in a child becomes pending again
                     for thread in threads:
                         thread.join()
                     continue
                 started(index)
-                results[index] = function(*arguments[index])
+                calls.results[index] = function(*arguments[index])
         except BaseException:
-            pending.clear()
+            calls.pending.clear()
             self.close()  # ends the calls of the children
             raise
         finally:
             for thread in threads:
                 thread.join()
-        self._child_failed = self._child_failed or any(thread.failed for thread in threads)
-        return results
+        self._child_failed = self._child_failed or calls.child_failed
+        return calls.results
 
     def close(self) -> None:
         """End the children; a later ``map`` starts new ones."""
@@ -106,21 +111,10 @@ class FunctionWorkers:
             child.kill()
         self._children = []
 
-    def _start_sharing(
-        self,
-        function: Callable[..., Result],
-        arguments: Sequence[tuple[Any, ...]],
-        pending: deque[int],
-        results: list[Result | None],
-    ) -> list[_Sharing]:
-        if len(arguments) < 2 or self._child_failed:
-            return []
+    def _started_children(self) -> list[_Child]:
         while len(self._children) < self.processes - 1:
             self._children.append(_Child())
-        threads = [_Sharing(child, function, arguments, pending, results) for child in self._children]
-        for thread in threads:
-            thread.start()
-        return threads
+        return self._children
 
 
 class _Child:
@@ -143,39 +137,33 @@ class _Child:
         self.connection.close()
 
 
-class _Sharing(threading.Thread):
-    """Hands pending calls to a child until none is left, or until one fails, which is pending again."""
+class _Calls(Generic[Result]):
+    """Calls that this process and its children share."""
 
-    def __init__(
-        self,
-        child: _Child,
-        function: Callable[..., Any],
-        arguments: Sequence[tuple[Any, ...]],
-        pending: deque[int],
-        results: list[Any],
-    ) -> None:
-        super().__init__(name="function worker", daemon=True)
-        self.child, self.function, self.arguments = child, function, arguments
-        self.pending, self.results = pending, results
-        self.failed = False
+    def __init__(self, function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]]) -> None:
+        self.function, self.arguments = function, arguments
+        self.pending = deque(range(len(arguments)))
+        self.results: list[Result | None] = [None] * len(arguments)
+        self.child_failed = False
 
-    def run(self) -> None:
-        while (index := _next(self.pending)) is not None:
+    def next(self) -> int | None:
+        """Index of the next call, which is then no longer pending; None if none is left."""
+        try:
+            return self.pending.popleft()
+        except IndexError:
+            return None
+
+    def make_in(self, child: _Child) -> None:
+        """Hand pending calls to a child until none is left, or until one fails, which is pending again."""
+        while (index := self.next()) is not None:
             try:
-                self.child.connection.send((self.function, self.arguments[index]))
-                self.results[index] = self.child.connection.recv()
+                child.connection.send((self.function, self.arguments[index]))
+                self.results[index] = child.connection.recv()
             except Exception as error:  # whatever it is, the parent makes this call again, or raises the same error
                 log.info("a call in a child process failed (%s: %s)", type(error).__name__, error)
-                self.failed = True
+                self.child_failed = True
                 self.pending.append(index)
                 return
-
-
-def _next(pending: deque[int]) -> int | None:
-    try:
-        return pending.popleft()
-    except IndexError:
-        return None
 
 
 def serve(connection: Connection) -> None:

@@ -41,22 +41,13 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "throttle": _SHARE,
 }
 """Factor to the SI unit of each unit that a channel may come in; the first of each is the SI unit."""
-
-
-@dataclass(frozen=True, slots=True)
-class MappingSettings:
-    """Limits of what a mapping may declare, each with unit and reason."""
-
-    min_period_s: float = 1e-5
-    """[s] No sensor of a car samples faster than 100 kHz. Stamps that are closer have another unit (hours, days)."""
-    max_lag_s: float = 1.0
-    """[s] A declared lag of velocities or commands is at most this long; longer ones are in milliseconds. The slowest
-    known logger lags 0.1 s behind."""
-    max_lag_share: float = 0.1
-    """Share of a recording. A shift by a longer lag replaces more commands than this by the first or last one."""
-
-
-MAPPING_LIMITS = MappingSettings()
+MIN_PERIOD_S = 1e-5
+"""[s] No sensor of a car samples faster than 100 kHz. Stamps that are closer have another unit (hours, days)."""
+MAX_LAG_S = 1.0
+"""[s] A declared lag of velocities or commands is at most this long; longer ones are in milliseconds. The slowest known
+logger lags 0.1 s behind."""
+MAX_LAG_SHARE = 0.1
+"""Share of a recording. A shift by a longer lag replaces more commands than this by the first or last one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +124,7 @@ class ColumnMapping:
 
     def __post_init__(self) -> None:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
-        max_rate_hz = 1.0 / MAPPING_LIMITS.min_period_s
+        max_rate_hz = 1.0 / MIN_PERIOD_S
         if self.rate_hz is not None and not 0.0 < self.rate_hz <= max_rate_hz:
             raise ConfigError(
                 f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero, at most {max_rate_hz:g}."
@@ -207,9 +198,9 @@ class ColumnMapping:
 
 def _check_lag(option: str, lag_s: float) -> None:
     """Raise ConfigError for a lag [s] that no logger has."""
-    if not abs(lag_s) <= MAPPING_LIMITS.max_lag_s:
+    if not abs(lag_s) <= MAX_LAG_S:
         raise ConfigError(
-            f"{option} is {lag_s:g} s, but a lag is at most {MAPPING_LIMITS.max_lag_s:g} s; give it in seconds, for "
+            f"{option} is {lag_s:g} s, but a lag is at most {MAX_LAG_S:g} s; give it in seconds, for "
             "example 0.05 for 50 ms."
         )
 

@@ -15,7 +15,6 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.recording.episode_builder import LATE, POLICY_TIME, POSE_AGE, goal_of, outlines_of, polygon_of
-from carlab.recording.rerun.screenshot import save_screenshot as save_screenshot
 from carlab.recording.sink import describe_os_error, make_folder
 
 CAR_LENGTH_M = 0.42

@@ -6,10 +6,10 @@ import dataclasses
 import logging
 import queue
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
-from carlab.core.clock import monotonic_ns, wall_clock_ns
+from carlab.core.clock import MonotonicClock, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, SafetyEvent
 from carlab.core.errors import NotOpenError
 from carlab.core.outcome import EndReason
@@ -42,6 +42,7 @@ class Recorder(Resource):
         self._flush_interval_s = flush_interval_s
         self._queue: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._lock = threading.Lock()
+        self._clock = MonotonicClock()
         self._thread: threading.Thread | None = None
         self._closing = False
         self._dropped = 0
@@ -105,8 +106,8 @@ class Recorder(Resource):
         progress, give_up_s = -1, 0.0
         while self._thread.is_alive():
             if progress != self._progress:
-                progress, give_up_s = self._progress, monotonic_ns() * 1e-9 + timeout_s
-            elif monotonic_ns() * 1e-9 >= give_up_s:
+                progress, give_up_s = self._progress, self._clock.now_s() + timeout_s
+            elif self._clock.now_s() >= give_up_s:
                 self._store_failure(
                     f"The recording is incomplete: its writer made no progress for {timeout_s:g} s. Its .partial "
                     "file has the documents written so far; check the disk."
@@ -116,11 +117,11 @@ class Recorder(Resource):
 
     def _run(self) -> None:
         sinks = list(self._sinks)
-        next_flush_s = monotonic_ns() * 1e-9 + self._flush_interval_s
+        next_flush_s = self._clock.now_s() + self._flush_interval_s
         unflushed = False
         while True:
             try:
-                item = self._queue.get(timeout=max(0.0, next_flush_s - monotonic_ns() * 1e-9))
+                item = self._queue.get(timeout=max(0.0, next_flush_s - self._clock.now_s()))
             except queue.Empty:
                 item = None
             if item is _CLOSE:
@@ -128,38 +129,27 @@ class Recorder(Resource):
             if item is not None:
                 unflushed = True
                 self._write(sinks, cast(Item, item))
-                self._progress += 1
-            if (now_s := monotonic_ns() * 1e-9) >= next_flush_s:
+            if (now_s := self._clock.now_s()) >= next_flush_s:
                 next_flush_s = now_s + self._flush_interval_s
                 if unflushed:
-                    self._flush(sinks)
+                    self._for_each(sinks, _flush)
                     unflushed = False
-        for sink in sinks:
-            try:
-                sink.close()
-            except Exception as error:
-                self._close_failed_sink(sink, error)
-            self._progress += 1
+        self._for_each(sinks, Sink.close)
 
     def _write(self, sinks: list[Sink], item: Item) -> None:
         if isinstance(item, EpisodeEnded) and self._dropped:
             item = dataclasses.replace(item, statistics={**item.statistics, "recorder_dropped": float(self._dropped)})
-        for sink in tuple(sinks):
-            try:
-                sink.write(item)
-            except Exception as error:
-                sinks.remove(sink)
-                self._close_failed_sink(sink, error)
+        self._for_each(sinks, lambda sink: sink.write(item))
 
-    def _flush(self, sinks: list[Sink]) -> None:
+    def _for_each(self, sinks: list[Sink], action: Callable[[Sink], None]) -> None:
+        """Apply an action to each sink; one that raises is closed and removed from ``sinks``."""
         for sink in tuple(sinks):
-            if sink.finished:
-                continue
             try:
-                sink.flush()
+                action(sink)
             except Exception as error:
                 sinks.remove(sink)
                 self._close_failed_sink(sink, error)
+            self._progress += 1
 
     def _close_failed_sink(self, sink: Sink, error: Exception) -> None:
         """Close a sink that raised an error, and store the error.
@@ -185,6 +175,11 @@ class Recorder(Resource):
     def _store_failure(self, sentence: str) -> None:
         if self._failed is None:
             self._failed = sentence
+
+
+def _flush(sink: Sink) -> None:
+    if not sink.finished:
+        sink.flush()
 
 
 class _RecorderHandler(logging.Handler):

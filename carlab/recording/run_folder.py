@@ -55,9 +55,7 @@ class RunDirectory:
     path: Path
 
     @classmethod
-    def create(
-        cls, root: Path | str, name: str, *, config_toml: str = "", metadata: Mapping[str, str] | None = None
-    ) -> Self:
+    def create(cls, root: Path | str, name: str, *, config_toml: str = "") -> Self:
         """Create ``root/<date>_<time>_<name>`` with the folder of its episodes, its configuration and environment.
 
         If this fails or is interrupted, no folder remains.
@@ -66,7 +64,6 @@ class RunDirectory:
             root: Folder of all runs, usually ``runs``.
             name: Name of the run; characters that are invalid in file names become ``-``.
             config_toml: The car file of the run.
-            metadata: Further facts for environment.json.
 
         Raises:
             DataError: The folder cannot be written.
@@ -76,7 +73,7 @@ class RunDirectory:
         base = Path(root) / f"{stamp}_{slug}"
         if base.parent.exists() and not base.parent.is_dir():
             raise DataError(f"{base.parent} is a file, not a folder for runs; choose another folder.")
-        facts = {**environment(), **(metadata or {})}
+        facts = environment()
         with writing(base):
             base.parent.mkdir(parents=True, exist_ok=True)
             path, number = base, 1
@@ -197,10 +194,6 @@ class RunDirectory:
             return [row for row in rows if isinstance(row, dict) and type(row.get("episode")) is int]
         except (OSError, ValueError, KeyError, TypeError):
             return []
-
-    def write_result(self, result: Mapping[str, Any]) -> None:
-        """Write result.json. Raises DataError if that fails."""
-        self.write_json(RESULT_FILE, result)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file atomically. Raises DataError if that fails."""

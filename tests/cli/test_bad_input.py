@@ -5,7 +5,6 @@ import os
 import re
 import socket
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,7 @@ from carlab.core.clock import MonotonicClock
 from mocap.emulators.faults import ServerFaults
 from mocap.natnet.models import BitstreamVersion
 from sim_backends.car_parameters import SimulatorConfig
-
-Outcome = tuple[int, str]
-Carlab = Callable[..., Outcome]
+from tests.helpers.command_line import Carlab
 
 CAR = """
 [hardware]

@@ -22,9 +22,9 @@ from carlab.cli import _verbs
 from carlab.jobs.child_jobs import ChildJob, Executor, JobEnd
 from carlab.jobs.child_processes import ChildEnd
 from sim_backends import SimulatorConfig
+from tests.helpers.command_line import Carlab
 from tests.helpers.recorded_drives import drive
 
-Carlab = Callable[..., tuple[int, str]]
 REGRESSION = ("bench", "regression", "--case", "1d", "--seeds", 2, "--methods", "SysID", "gp-posterior", "--steps", 40)
 
 

@@ -25,8 +25,8 @@ from carlab.studies.regression.methods import METHODS
 from carlab.studies.regression.scores import FIGURES, Score, as_json, summarised
 from carlab.studies.regression.study import run_study
 from learning.evaluation import Mixture
+from tests.helpers.command_line import Carlab
 
-Carlab = Callable[..., tuple[int, str]]
 SMALL = ("bench", "regression", "--case", "pendulum", "--rows", 5, "--methods", "ridge", "SysID")
 RIDGE = METHODS["ridge"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from carlab.benchmark.world.measurement import COLUMNS, write_csv
 from carlab.core.quantities import Action, CarState
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.plant import Plant
+from tests.helpers.command_line import Carlab
 
-Carlab = Callable[..., tuple[int, str]]
 CAR = SimulatorConfig.from_preset()
 
 

@@ -41,24 +41,25 @@ def test_residuals_of_the_true_simulator_have_the_noise_of_the_case():
     assert torch.allclose(residual_std, torch.tensor(case.noise_std), rtol=0.1)
 
 
+@pytest.fixture
+def fits(monkeypatch):
+    """The prior and the settings of each fit by fSVGD, which makes two steps only."""
+    received = []
+
+    def spy(inputs, outputs, pool, prior, normaliser, settings):
+        received.append((prior, settings))
+        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
+
+    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
+    return received
+
+
 @pytest.mark.usefixtures("short_identification")
 def test_printed_scores_are_written_to_the_file(tmp_path, capsys, monkeypatch):
     out = tmp_path / "study.json"
-    arguments = [
-        "bench",
-        "regression",
-        "--case",
-        "1d",
-        "--seeds",
-        "2",
-        "--methods",
-        "SysID",
-        "gp-posterior",
-        "--steps",
-        "40",
-    ]
-    monkeypatch.setattr("sys.argv", ["carlab", *arguments, "--out", str(out)])
-    assert run([*arguments, "--out", str(out)]) == 0
+    arguments = f"bench regression --case 1d --seeds 2 --methods SysID gp-posterior --steps 40 --out {out}".split()
+    monkeypatch.setattr("sys.argv", ["carlab", *arguments])
+    assert run(arguments) == 0
     printed = capsys.readouterr().out
     study = json.loads(out.read_text())
     assert study["schema"] == "carlab.regression/1"
@@ -79,17 +80,10 @@ def test_printed_scores_are_written_to_the_file(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(("rows", "steps"), [(5, 5000), (400, 8000)])
-def test_authors_settings_are_those_of_their_public_code(monkeypatch, rows, steps):
+def test_authors_settings_are_those_of_their_public_code(fits, rows, steps):
     """lasgroup/simulation_transfer at 547fa14, run_regression_exp.py and the commands of its sweeps."""
-    received = []
-
-    def spy(inputs, outputs, pool, prior, normaliser, settings):
-        received.append(settings)
-        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
-
-    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
     list(run_study("pendulum", rows=(rows,), seeds=1, methods=("sim-fsvgd",)))
-    (used,) = received
+    ((_, used),) = fits
     assert (used.particles, used.hidden, used.batch, used.measurement_points) == (20, (64, 64, 64), 8, 32)
     assert (used.bandwidth, used.learning_rate, used.weight_decay, used.steps) == (2.0, 1e-3, 1e-3, steps)
     # One optimiser for networks and noise, without a schedule; a faster rate of the noise collapses it with five rows.
@@ -99,21 +93,14 @@ def test_authors_settings_are_those_of_their_public_code(monkeypatch, rows, step
     assert np.allclose(used.noise_std, np.array([0.05, 0.05, 0.5]) / np.array([0.158, 0.150, 0.951]))
 
 
-def test_authors_settings_of_the_1d_case_differ_between_the_methods(monkeypatch):
+def test_authors_settings_of_the_1d_case_differ_between_the_methods(fits):
     """lasgroup/simulation_transfer at 547fa14, 1d_visualization_run_training.py."""
-    received = []
-
-    def spy(inputs, outputs, pool, prior, normaliser, settings):
-        received.append(settings)
-        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
-
-    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
     list(run_study("1d", seeds=1, methods=("sim-fsvgd", "fsvgd")))
-    sim_fsvgd, fsvgd = received
+    sim_fsvgd, fsvgd = (settings for _, settings in fits)
     assert (sim_fsvgd.steps, sim_fsvgd.bandwidth) == (20_000, 1.0)
     assert (fsvgd.steps, fsvgd.bandwidth) == (10_000, 0.5)
-    assert {(t.batch, t.measurement_points, t.fit_noise) for t in received} == {(4, 8, False)}
-    assert all(np.allclose(t.noise_std, 0.05) for t in received)
+    assert {(t.batch, t.measurement_points, t.fit_noise) for _, t in fits} == {(4, 8, False)}
+    assert all(np.allclose(t.noise_std, 0.05) for _, t in fits)
 
 
 def test_study_is_reproducible():
@@ -159,7 +146,6 @@ def test_missing_data_is_reported_before_the_first_fit(tmp_path, monkeypatch):
         ("regression --out none/x.json", "--out none/x.json: there is no folder none; create it first."),
         ("regression --out x.png", "--out x.png: name a file that ends in .json."),
         ("regression --out folder.json", "--out folder.json: name a file that ends in .json."),
-        ("speed --case pendulum", "--case has no effect in 'bench speed'; use it with 'bench regression'."),
     ],
 )
 def test_invalid_options_are_refused_before_the_study(tmp_path, monkeypatch, capsys, options, message):
@@ -202,34 +188,20 @@ def test_hidden_effect_changes_the_rate_as_its_equation(name, acceleration):
     assert np.allclose((with_effect - without).numpy(), expected, atol=1e-9)
 
 
-def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
+def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(fits):
     """Authors' bnn_fsvgd.py: only the driving term is summed; the Gaussian process has weight 1 / (L (batch + k))."""
-    received = {}
-
-    def spy(inputs, outputs, pool, prior, normaliser, settings):
-        received[len(received)] = settings
-        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
-
-    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
     names = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected")
     list(run_study("pendulum", rows=(20,), seeds=1, methods=names))
-    assert [(s.repulsion, s.prior_exponent) for s in received.values()] == [
+    assert [(s.repulsion, s.prior_exponent) for _, s in fits] == [
         (0.05, 1.0), (1.0, 1.0), (0.05, 1.0 / (20 * (8 + 32))), (1.0, 1.0),
     ]  # fmt: skip
 
 
-def test_variants_change_only_the_prior_of_sim_fsvgd(monkeypatch):
-    received = []
-
-    def spy(inputs, outputs, pool, prior, normaliser, settings):
-        received.append((prior, settings))
-        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
-
-    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
+def test_variants_change_only_the_prior_of_sim_fsvgd(fits):
     names = ("sim-fsvgd", *regression_methods.VARIANTS)
     scores = list(run_study("pendulum", rows=(5,), seeds=1, methods=names))
     assert [score.method for score in scores if score.failed is None] == list(names)
-    (published, settings), *variants = received
+    (published, settings), *variants = fits
     assert all(used == settings for _, used in variants)
     *estimated, (exact, _) = variants
     assert [type(prior.estimator) for prior, _ in estimated] == [KernelDensity, SpectralStein, NuMethod]

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from carlab.studies.regression.study import run_study
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab
 
 
 @pytest.mark.parametrize("verb", [("learn",), ("bench", "speed"), ("bench", "regression")])

@@ -6,13 +6,12 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 from carlab.cars import load_car_file
 from drivers.calibration import ActuatorCalibration
+from tests.helpers.command_line import Carlab
 
-Carlab = Callable[..., tuple[int, str]]
 ARENA = "[hardware.arena]\ncorners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]\n"
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
 import json
 import math
 import shutil
@@ -20,22 +18,12 @@ import torch
 
 import carlab.cars as carlab_cars
 from carlab.api import learning
-from carlab.cli import run
 from carlab.experiment.campaign.training import TrainingRequest
 from carlab.recording.mcap.source import read_episode
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab, run_command
 
 TICKS = 20
 TINY = ("--ticks", TICKS, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun")
-
-
-def run_command(*argv: object) -> tuple[int, str]:
-    """Exit code of a valid command line, and its output on one line."""
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
-        code = run([str(a) for a in argv])
-    return code, " ".join(out.getvalue().split())
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -64,6 +52,17 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
     result = *run_command("learn", "--resume", folder, "--episodes", 3), folder
     assert json.loads((folder / "campaign.json").read_text())["episodes"] == 3
     return result
+
+
+@pytest.fixture
+def copied(learned: tuple[int, str, Path], tmp_path: Path) -> Path:
+    """A copy of the folder of that run, which a test may change."""
+    return Path(shutil.copytree(learned[2], tmp_path / learned[2].name))
+
+
+def file_contents(folder: Path) -> dict[Path, bytes]:
+    """The content of each file of a run folder except its log."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "log.jsonl"}
 
 
 @pytest.mark.parametrize(
@@ -105,22 +104,20 @@ def test_invalid_options_are_refused_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(learned[2], folder)
-    files = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "log.jsonl"}
+def test_resume_refuses_another_car(carlab: Carlab, copied: Path, tmp_path: Path) -> None:
+    files = file_contents(copied)
     for options in (("--car", "emulated"), ("--car", "eth_rc_car"), ("--dry-run",)):
-        code, text = carlab("learn", "--resume", folder, *options)
+        code, text = carlab("learn", "--resume", copied, *options)
         assert code == 2
         assert "was started with other options; resume it with '--car sim'" in text
     heavier = tmp_path / "heavier.toml"
-    text = (folder / "config.toml").read_text()
+    text = (copied / "config.toml").read_text()
     assert text.count("value = 1.65") == 1
     heavier.write_text(text.replace("value = 1.65", "value = 1.69"))
-    code, text = carlab("learn", "--resume", folder, "--car", heavier)
+    code, text = carlab("learn", "--resume", copied, "--car", heavier)
     assert code == 2
     assert "was started with other options; resume it with '--car sim'" in text
-    assert {path: path.read_bytes() for path in files} == files
+    assert file_contents(copied) == files
 
 
 @pytest.mark.parametrize(
@@ -149,31 +146,24 @@ def test_resume_refuses_changed_options(
     assert message in text
 
 
-def test_model_of_another_version_is_trained_again_after_its_folder_is_removed(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(learned[2], folder)
-    done = sorted(path.name for path in (folder / "models").iterdir())
-    torch.save({"version": 1}, folder / "models" / done[-1] / "dynamics.pt")
-    options = ("learn", "--resume", folder, "--episodes", len(done) + 1)
+def test_model_of_another_version_is_trained_again_after_its_folder_is_removed(carlab: Carlab, copied: Path) -> None:
+    done = sorted(path.name for path in (copied / "models").iterdir())
+    torch.save({"version": 1}, copied / "models" / done[-1] / "dynamics.pt")
+    options = ("learn", "--resume", copied, "--episodes", len(done) + 1)
     code, text = carlab(*options)
     assert code == 1
     assert "has version 1" in text
     assert "remove its folder to train again." in text
-    shutil.rmtree(folder / "models" / done[-1])
+    shutil.rmtree(copied / "models" / done[-1])
     code, text = carlab(*options)
     assert code == 0
-    assert len(json.loads((folder / "learn.json").read_text())["episodes"]) == len(done) + 1
+    assert len(json.loads((copied / "learn.json").read_text())["episodes"]) == len(done) + 1
 
 
-def test_resume_accepts_a_car_file_with_equal_parameters(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
-) -> None:
-    folder, same = tmp_path / "run", tmp_path / "same.toml"
-    shutil.copytree(learned[2], folder)
-    same.write_text("# A remark.\n" + (folder / "config.toml").read_text())
-    code, text = carlab("learn", "--resume", folder, "--car", same)
+def test_resume_accepts_a_car_file_with_equal_parameters(carlab: Carlab, copied: Path, tmp_path: Path) -> None:
+    same = tmp_path / "same.toml"
+    same.write_text("# A remark.\n" + (copied / "config.toml").read_text())
+    code, text = carlab("learn", "--resume", copied, "--car", same)
     assert code == 0
     assert "is complete" in text
 
@@ -195,16 +185,12 @@ def test_resume_accepts_a_car_file_with_equal_parameters(
         (("plan", "updates"), 10**400),
     ],
 )
-def test_resume_refuses_an_edited_campaign(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, keys: tuple[str, ...], value: object
-) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(learned[2], folder, ignore=shutil.ignore_patterns("models"))
-    content = json.loads((folder / "campaign.json").read_text())
+def test_resume_refuses_an_edited_campaign(carlab: Carlab, copied: Path, keys: tuple[str, ...], value: object) -> None:
+    content = json.loads((copied / "campaign.json").read_text())
     *parents, name = keys
     functools.reduce(lambda table, key: table[key], parents, content)[name] = value
-    (folder / "campaign.json").write_text(json.dumps(content))
-    code, text = carlab("learn", "--resume", folder)
+    (copied / "campaign.json").write_text(json.dumps(content))
+    code, text = carlab("learn", "--resume", copied)
     assert code == 1
     assert "cannot be resumed (campaign.json: " in text
 
@@ -214,15 +200,11 @@ def test_resume_refuses_an_edited_campaign(
     ["x = [", "x = " + "[" * 3000, "x = " + "9" * 5000, None],
     ids=["cut", "nested", "long integer", "missing"],
 )
-def test_run_whose_car_is_unknown_is_not_resumed(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, content: str | None
-) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(learned[2], folder)
-    (folder / "config.toml").unlink()
+def test_run_whose_car_is_unknown_is_not_resumed(carlab: Carlab, copied: Path, content: str | None) -> None:
+    (copied / "config.toml").unlink()
     if content is not None:
-        (folder / "config.toml").write_text(content)
-    code, text = carlab("learn", "--resume", folder, "--car", "eth_rc_car")
+        (copied / "config.toml").write_text(content)
+    code, text = carlab("learn", "--resume", copied, "--car", "eth_rc_car")
     assert code == 1
     assert "its car is unknown (config.toml: " in text
 
@@ -255,40 +237,36 @@ def test_run_trains_drives_and_prints_its_results(learned: tuple[int, str, Path]
     assert sorted(p.name for p in folder.glob("models/*")) == ["0001", "0002"]
 
 
-def test_resuming_a_complete_run_changes_no_file(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
+def test_resuming_a_complete_run_prints_a_message_and_changes_no_file(
+    carlab: Carlab, learned: tuple[int, str, Path]
+) -> None:
     folder = learned[2]
-    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"}
-    code, _ = carlab("learn", "--resume", folder)
+    before = file_contents(folder)
+    code, text = carlab("learn", "--resume", folder)
     assert code == 0
-    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"} == before
+    assert text.rpartition("╯")[2].strip()
+    assert file_contents(folder) == before
 
 
 @pytest.mark.parametrize("killed_before", ["row", "report", "result"])
 def test_run_killed_after_a_recording_writes_its_report_when_it_is_resumed(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, killed_before: str
+    carlab: Carlab, copied: Path, killed_before: str
 ) -> None:
-    folder = tmp_path / learned[2].name
-    shutil.copytree(learned[2], folder)
-    complete = json.loads((folder / "result.json").read_text())
-    curve = json.loads((folder / "learn.json").read_text())
-    (folder / "result.json").write_text(json.dumps({**complete, "episodes": complete["episodes"][:1]}))
+    complete = json.loads((copied / "result.json").read_text())
+    curve = json.loads((copied / "learn.json").read_text())
+    (copied / "result.json").write_text(json.dumps({**complete, "episodes": complete["episodes"][:1]}))
     if killed_before != "result":
-        (folder / "learn.png").unlink()
-        (folder / "learn.rrd").unlink()
+        (copied / "learn.png").unlink()
+        (copied / "learn.rrd").unlink()
     if killed_before == "row":
-        (folder / "learn.json").write_text(json.dumps({**curve, "episodes": curve["episodes"][:1]}))
-    assert carlab("learn", "--resume", folder)[0] == 0
-    assert json.loads((folder / "result.json").read_text()) == complete
-    assert [row["total_reward"] for row in json.loads((folder / "learn.json").read_text())["episodes"]] == [
+        (copied / "learn.json").write_text(json.dumps({**curve, "episodes": curve["episodes"][:1]}))
+    assert carlab("learn", "--resume", copied)[0] == 0
+    assert json.loads((copied / "result.json").read_text()) == complete
+    assert [row["total_reward"] for row in json.loads((copied / "learn.json").read_text())["episodes"]] == [
         row["total_reward"] for row in curve["episodes"]
     ]
-    assert (folder / "learn.png").stat().st_size > 0
-    assert (folder / "learn.rrd").stat().st_size > 0
-
-
-def test_resuming_a_complete_run_prints_a_message(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
-    _, text = carlab("learn", "--resume", learned[2])
-    assert text.rpartition("╯")[2].strip()
+    assert (copied / "learn.png").stat().st_size > 0
+    assert (copied / "learn.rrd").stat().st_size > 0
 
 
 def test_complete_run_is_resumed_with_more_episodes(extended: tuple[int, str, Path]) -> None:
@@ -336,16 +314,14 @@ def interrupted(request: TrainingRequest, progress: Any, stop: Callable[[], bool
 
 
 def test_interrupted_run_prints_the_command_that_resumes_it(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    carlab: Carlab, copied: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("carlab.experiment.campaign.campaign.train_in_subprocess", interrupted)
-    folder = tmp_path / "run"
-    shutil.copytree(learned[2], folder)
-    campaign = json.loads((folder / "campaign.json").read_text())
-    (folder / "campaign.json").write_text(json.dumps(campaign | {"episodes": 5}))
-    code, text = carlab("learn", "--resume", folder)
+    campaign = json.loads((copied / "campaign.json").read_text())
+    (copied / "campaign.json").write_text(json.dumps(campaign | {"episodes": 5}))
+    code, text = carlab("learn", "--resume", copied)
     assert code == 130
-    assert f"2 of 5 episodes; resume with: carlab learn --resume {folder}" in text
+    assert f"2 of 5 episodes; resume with: carlab learn --resume {copied}" in text
 
 
 def test_training_on_ray_gives_the_run_without_ray(
@@ -378,16 +354,15 @@ def test_resume_command_is_printed_only_if_the_run_folder_exists(
 
 @pytest.mark.parametrize("name", ["agent.zip", "policy.npz", "dynamics.pt"])
 def test_resume_executes_no_pickled_code_of_the_run_folder(
-    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, name: str
+    carlab: Carlab, copied: Path, tmp_path: Path, name: str
 ) -> None:
     """The last model of the run contains a pickle that would create a folder."""
-    folder, created_by_pickle = tmp_path / "run", tmp_path / "made"
-    shutil.copytree(learned[2], folder)
-    model = folder / "models" / "0002"
+    created_by_pickle = tmp_path / "made"
+    model = copied / "models" / "0002"
     for file in ("policy.npz",) if name == "agent.zip" else (name,):
         (model / file).unlink()
     (model / name).write_bytes(b"cposix\nmkdir\n(V" + str(created_by_pickle).encode() + b"\ntR.")
-    code, text = carlab("learn", "--resume", folder, "--episodes", 3)
+    code, text = carlab("learn", "--resume", copied, "--episodes", 3)
     assert not created_by_pickle.exists()
     assert code == 1
     assert "Traceback" not in text

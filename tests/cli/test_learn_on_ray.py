@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,8 +10,7 @@ import tyro
 
 from carlab.cli.console import progress
 from carlab.cli.learn import Learn
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab
 
 
 def test_missing_ray_is_refused_before_the_run(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

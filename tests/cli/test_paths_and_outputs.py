@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,7 @@ from carlab import cli
 from carlab.cli.console import PACKAGES, log_to_console
 from carlab.recording.csv.table import read_csv
 from tests.cli.test_bad_input import canonical_csv, write
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,8 @@ from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.proof import runner
 from carlab.benchmark.proof.runner import Proof
 from carlab.jobs.child_jobs import LocalExecutor
+from tests.helpers.command_line import Carlab
 
-Carlab = Callable[..., tuple[int, str]]
 ROOT = Path(__file__).resolve().parents[2]
 FAKE_DIAGNOSIS = ROOT / "tests" / "benchmark" / "fake_diagnosis.py"
 SPECS = [

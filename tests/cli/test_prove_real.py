@@ -1,7 +1,6 @@
 """``carlab prove --set real``: recordings of a folder, a sealed run, and refusals in one sentence."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,8 +10,8 @@ from carlab.api.cars import load_car
 from carlab.cli.prove_real import car_path
 from carlab.recording.csv.export import write_csv
 from sim_backends import SimulatorConfig
+from tests.helpers.command_line import Carlab
 
-Carlab = Callable[..., tuple[int, str]]
 FAKE = Path(__file__).resolve().parents[1] / "benchmark" / "fake_comparison.py"
 
 

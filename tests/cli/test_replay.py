@@ -2,13 +2,13 @@
 
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab
+
 HEADER = "t,x,y,yaw,vx,vy,yaw_rate,steering,throttle"
 
 
@@ -78,12 +78,6 @@ def test_adaptation_to_a_car_that_turns_more_than_its_simulator_is_printed(carla
         assert quantity in text
     assert "The noise of the adaptation was chosen on this recording" in text
     assert "adapted" not in carlab("replay", path)[1]
-
-
-def test_adaptation_and_driving_exclude_each_other(carlab: Carlab, tmp_path: Path) -> None:
-    code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0), "--adapt", "--drive")
-    assert code == 2
-    assert "--adapt is for predictions by a simulated car; remove it to drive." in text
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,8 +20,7 @@ from carlab.experiment.episodes.scripted_policies import ReplayPolicy
 from carlab.experiment.episodes.teleop_policy import KeyboardSource, TeleopInput
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab
 
 
 def test_run_folder_contains_results_and_log(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

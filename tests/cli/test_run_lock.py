@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import pytest
 from carlab.api import learning
 from carlab.core.errors import ConfigError
 from carlab.recording.run_folder import RunDirectory
+from tests.helpers.command_line import Carlab
 
-Carlab = Callable[..., tuple[int, str]]
 LEARN = ("learn", "--car", "sim", "--ticks", 20, "--model-steps", 20, "--updates", 20, "--history", 1, "--no-rerun")
 
 

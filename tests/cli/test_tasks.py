@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from carlab.cli import run
 from carlab.cli.learn import _training_messages
 from carlab.core.observation import episode_features
 from carlab.core.task import ObstacleParkingTask
 from carlab.core.track import oval_track
 from carlab.recording.mcap.source import read_episode
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab, run_command
 
 TICKS = 20
 TINY = ("--ticks", TICKS, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun", "--episodes", 1)
@@ -73,11 +68,9 @@ class Broken(Forward):
 
 
 def learn(out: Path, *options: object) -> tuple[int, str, Path]:
-    text = io.StringIO()
-    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
-        code = run([str(a) for a in ("learn", "--out", out, *TINY, *options)])
+    code, text = run_command("learn", "--out", out, *TINY, *options)
     (folder,) = out.iterdir()
-    return code, " ".join(text.getvalue().split()), folder
+    return code, text, folder
 
 
 @pytest.fixture(scope="module")

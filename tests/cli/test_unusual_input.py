@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ import pytest
 
 from carlab.cli.console import console, table
 from tests.cli.test_bad_input import canonical_csv, write
-
-Carlab = Callable[..., tuple[int, str]]
+from tests.helpers.command_line import Carlab
 
 
 @pytest.mark.parametrize("name", ["drive[v2].csv", "[red]drive.csv", "Über die Straße 1.csv", "a[/b].csv"])

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.helpers.command_line import Carlab
 from tests.helpers.rerun_files import cells, tabs
-
-Carlab = Callable[..., tuple[int, str]]
 
 
 def test_run_folder_is_one_recording_of_its_episodes(

@@ -389,7 +389,7 @@ class TestRepairedImport:
             import_csv(tmp_path / "drive.csv")
         read = import_repaired(tmp_path / "drive.csv")
         assert {f.id for f in read.repaired} == {"wrong_unit", "dropouts"}
-        episode = read.imported.episode
+        episode = read.episode
         np.testing.assert_allclose(np.cos(episode.states[:, YAW]), np.cos(clean.states[keep, YAW]), atol=1e-6)
         assert np.ptp(episode.extra["segment"]) == 1
 

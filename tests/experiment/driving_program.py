@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 from carlab.cars import default_car
@@ -18,6 +17,7 @@ from carlab.core.documents import Tick
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState
+from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import RecordedTask
 from carlab.experiment.episodes.hooks import RunHooks
 from carlab.experiment.episodes.session import Session
@@ -99,7 +99,7 @@ def main(folder: str, misbehaviour: str) -> int:
             car,
             MisbehavingPolicy(misbehaviour),
             RecordedTask(CarState(), max_ticks=FOREVER_TICKS),
-            replace(_envelope()),
+            SafetyEnvelope(),
             run,
             1 / 30,
             record_rerun=misbehaviour == "recorder_error",
@@ -109,12 +109,6 @@ def main(folder: str, misbehaviour: str) -> int:
         results = session.drive(1)
     print(f"ended {results[0].reason.name}", flush=True)
     return 4 if results[0].reason.is_safety_stop else 0
-
-
-def _envelope():  # type: ignore[no-untyped-def]
-    from carlab.core.safety import SafetyEnvelope
-
-    return SafetyEnvelope()
 
 
 if __name__ == "__main__":

@@ -248,8 +248,7 @@ def test_policy_and_training_features_contain_the_past_commands(
 
 def test_interrupted_episode_is_kept_and_repeated(interrupted: InterruptedRun, tmp_path: Path) -> None:
     """The recording is moved to ``stopped``, and the run reaches the requested number of complete episodes."""
-    run = RunDirectory.create(tmp_path, "stopped")
-    shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
+    run = interrupted.copied(tmp_path, "0001")
     steps: list[int] = []
 
     def on_tick(tick: Tick) -> None:
@@ -274,8 +273,7 @@ def test_interrupted_episode_is_kept_and_repeated(interrupted: InterruptedRun, t
 def test_episode_of_a_car_that_cannot_be_armed_is_repeated(
     interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = RunDirectory.create(tmp_path, "not-ready")
-    shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
+    run = interrupted.copied(tmp_path, "0001")
     choice = choose_car("sim", seed=0)
     figures: list[EpisodeFigures] = []
     hooks = LearnHooks(on_figures=figures.append)
@@ -297,11 +295,7 @@ def test_episode_of_a_car_that_cannot_be_armed_is_repeated(
 def test_hung_episode_is_moved_to_stopped_if_no_model_was_trained_on_it(
     interrupted: InterruptedRun, tmp_path: Path
 ) -> None:
-    run = RunDirectory.create(tmp_path, "killed")
-    for model in ("0001", "0002"):
-        shutil.copytree(interrupted.run.models / model, run.models / model)
-    for recording in interrupted.run.recordings():
-        shutil.copy(recording, run.episodes)
+    run = interrupted.copied(tmp_path, "0001", "0002", recordings=True)
     last_recording = run.recordings()[-1]
     documents = read_documents(last_recording)
     with Recorder([McapSink(run.episode_path(3))]) as recorder:
@@ -323,11 +317,7 @@ def test_hung_episode_is_moved_to_stopped_if_no_model_was_trained_on_it(
 def test_missing_row_of_the_learning_curve_is_restored_from_the_recording(
     interrupted: InterruptedRun, tmp_path: Path
 ) -> None:
-    run = RunDirectory.create(tmp_path, "rows")
-    for recording in interrupted.run.recordings():
-        shutil.copy(recording, run.episodes)
-    for model in interrupted.run.models.iterdir():
-        shutil.copytree(model, run.models / model.name)
+    run = interrupted.copied(tmp_path, "0001", "0002", recordings=True)
     complete = json.loads((interrupted.run.path / "learn.json").read_text())
     (run.path / "learn.json").write_text(json.dumps({**complete, "episodes": complete["episodes"][:1]}))
     restore_missing_rows(run, interrupted.plan.task)
@@ -378,10 +368,9 @@ def test_real_car_drives_no_further_episode_after_a_safety_stop(
 ) -> None:
     choice = choose_car("sim", seed=0)
     monkeypatch.setattr(choice.car, "reality", reality)
-    run = RunDirectory.create(tmp_path, "outside")
-    for model in ("0001", "0002")[:n_episodes]:
-        without_check = shutil.ignore_patterns("diagnosis.json")
-        shutil.copytree(interrupted.run.models / model, run.models / model, ignore=without_check)
+    run = interrupted.copied(tmp_path, *("0001", "0002")[:n_episodes])
+    for diagnosis in run.models.glob("*/diagnosis.json"):
+        diagnosis.unlink()
     with choice.car as car:
         car.place(CarState(5.0, 5.0))
         results = list(Campaign(choice, interrupted.plan, 2, run, place=False, record_rerun=False).run_episodes())

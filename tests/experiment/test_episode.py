@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from episodes import PERIOD_S, drive_episode
 from terminating_parking import TerminatingParking
 
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
@@ -18,7 +19,7 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import NEUTRAL, Action, CarState
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask, RecordedTask
-from carlab.experiment.episodes.episode import EpisodeHooks, run_episode
+from carlab.experiment.episodes.episode import EpisodeHooks
 from carlab.experiment.episodes.scripted_policies import (
     ManoeuvrePolicy,
     NeutralPolicy,
@@ -27,8 +28,6 @@ from carlab.experiment.episodes.scripted_policies import (
 )
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.simulated_car import SimulatedCar
-
-PERIOD_S = 1.0 / 30.0
 
 
 class FunctionPolicy:
@@ -64,14 +63,8 @@ def sine_steering(step: int) -> Action:
 def test_documents_are_in_order_and_agree_with_the_arrays() -> None:
     documents: list[Document] = []
     with SimulatedCar() as car:
-        data = run_episode(
-            car,
-            FunctionPolicy(sine_steering),
-            ParkingTask(),
-            SafetyEnvelope(),
-            period_s=PERIOD_S,
-            max_ticks=40,
-            hooks=EpisodeHooks(emit=documents.append),
+        data = drive_episode(
+            car, FunctionPolicy(sine_steering), max_ticks=40, hooks=EpisodeHooks(emit=documents.append)
         )
     assert isinstance(documents[0], EpisodeStarted)
     assert isinstance(documents[-1], EpisodeEnded)
@@ -91,14 +84,8 @@ def test_documents_are_in_order_and_agree_with_the_arrays() -> None:
 def test_transition_holds_the_action_sent_at_its_tick() -> None:
     documents: list[Document] = []
     with SimulatedCar() as car:
-        run_episode(
-            car,
-            FunctionPolicy(lambda k: Action(k / 100, 0.0)),
-            ParkingTask(),
-            SafetyEnvelope(),
-            period_s=PERIOD_S,
-            max_ticks=20,
-            hooks=EpisodeHooks(emit=documents.append),
+        drive_episode(
+            car, FunctionPolicy(lambda k: Action(k / 100, 0.0)), max_ticks=20, hooks=EpisodeHooks(emit=documents.append)
         )
     for row in (d for d in documents if isinstance(d, Transition)):
         assert row.action.steering == pytest.approx(row.step / 100)
@@ -129,14 +116,7 @@ def test_episode_ends_with_its_reason_and_a_stopped_car(
 ) -> None:
     documents: list[Document] = []
     with StopCountingCar() as car:
-        data = run_episode(
-            car,
-            FunctionPolicy(act),
-            ParkingTask(),
-            envelope,
-            period_s=PERIOD_S,
-            hooks=EpisodeHooks(emit=documents.append),
-        )
+        data = drive_episode(car, FunctionPolicy(act), envelope=envelope, hooks=EpisodeHooks(emit=documents.append))
         assert car.stops[-1] is planned
     ended = documents[-1]
     assert isinstance(ended, EpisodeEnded)
@@ -159,9 +139,7 @@ def test_stop_request_ends_the_episode_after_the_tick() -> None:
 
     with SimulatedCar() as car:
         hooks = EpisodeHooks(stop_requested=stop)
-        data = run_episode(
-            car, FunctionPolicy(sine_steering), ParkingTask(), SafetyEnvelope(), period_s=PERIOD_S, hooks=hooks
-        )
+        data = drive_episode(car, FunctionPolicy(sine_steering), hooks=hooks)
     assert data.ticks == 10
     assert data.metadata["end_reason"] == "STOP_REQUESTED"
 
@@ -173,14 +151,7 @@ def test_recorder_error_is_raised_after_the_car_is_stopped() -> None:
 
     with StopCountingCar() as car:
         with pytest.raises(OSError, match="No space"):
-            run_episode(
-                car,
-                FunctionPolicy(sine_steering),
-                ParkingTask(),
-                SafetyEnvelope(),
-                period_s=PERIOD_S,
-                hooks=EpisodeHooks(emit=emit),
-            )
+            drive_episode(car, FunctionPolicy(sine_steering), hooks=EpisodeHooks(emit=emit))
         assert car.stops == [False]
 
 
@@ -188,7 +159,7 @@ def test_reached_goal_ends_the_episode_if_the_task_terminates_there() -> None:
     task = TerminatingParking()
     with SimulatedCar() as car:
         car.place(CarState(0.05, 0.0, 0.1))
-        data = run_episode(car, NeutralPolicy(), task, SafetyEnvelope(), period_s=PERIOD_S)
+        data = drive_episode(car, NeutralPolicy(), task)
     assert data.ticks == 1
     assert data.metadata["end_reason"] == "GOAL_REACHED"
 
@@ -196,13 +167,11 @@ def test_reached_goal_ends_the_episode_if_the_task_terminates_there() -> None:
 def test_replayed_commands_reproduce_the_episode() -> None:
     with SimulatedCar(seed=1) as car:
         car.place(CarState())
-        first = run_episode(
-            car, FunctionPolicy(sine_steering), RecordedTask(CarState(), 60), SafetyEnvelope(), period_s=PERIOD_S
-        )
+        first = drive_episode(car, FunctionPolicy(sine_steering), RecordedTask(CarState(), 60))
     with SimulatedCar(seed=1) as car:
         car.place(CarState())
         policy = ReplayPolicy(first.times_s[:-1], first.sent)
-        replayed = run_episode(car, policy, RecordedTask(CarState(), 100), SafetyEnvelope(), period_s=PERIOD_S)
+        replayed = drive_episode(car, policy, RecordedTask(CarState(), 100))
     assert replayed.metadata["end_reason"] == "POLICY_FINISHED"
     np.testing.assert_array_equal(replayed.sent, first.sent)
     np.testing.assert_allclose(replayed.states, first.states, atol=1e-9)
@@ -214,13 +183,8 @@ def test_parking_policy_parks_from_ten_starts() -> None:
     for seed in range(200, 210):
         with SimulatedCar(simulator, seed=seed) as car:
             car.place(task.sample_start(np.random.default_rng(seed)))
-            data = run_episode(
-                car,
-                ReverseParkingPolicy.for_car(simulator),
-                task,
-                SafetyEnvelope(arena_m=task.arena_m),
-                period_s=PERIOD_S,
-                max_ticks=150,
+            data = drive_episode(
+                car, ReverseParkingPolicy.for_car(simulator), task, SafetyEnvelope(arena_m=task.arena_m), max_ticks=150
             )
         assert task.summary(data.times_s, data.states)["success"], (seed, data.states[-1])
 
@@ -235,7 +199,7 @@ def test_manoeuvres_stay_in_range_and_end(name: str) -> None:
     assert manoeuvre.command(-0.1) == NEUTRAL
     with SimulatedCar() as car:
         task = RecordedTask(CarState(), 1000)
-        data = run_episode(car, ManoeuvrePolicy(manoeuvre), task, SafetyEnvelope(), period_s=PERIOD_S)
+        data = drive_episode(car, ManoeuvrePolicy(manoeuvre), task)
     assert data.metadata["end_reason"] == "POLICY_FINISHED"
     assert data.ticks == pytest.approx(manoeuvre.duration_s / PERIOD_S, abs=1)
 
@@ -284,7 +248,7 @@ def test_error_of_a_task_while_driving_stops_the_car_and_keeps_the_ticks(
     reward: Callable[[int], object], detail: str
 ) -> None:
     with StopCountingCar() as car:
-        data = run_episode(car, FunctionPolicy(sine_steering), WrongAtTick(reward), SafetyEnvelope(), period_s=PERIOD_S)
+        data = drive_episode(car, FunctionPolicy(sine_steering), WrongAtTick(reward))
         assert car.stops == [False]
     assert data.metadata["end_reason"] == EndReason.TASK_ERROR.name
     assert detail in data.metadata["end_detail"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from episodes import PERIOD_S, drive_episode
 
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick, Transition
 from carlab.core.errors import ActuatorFaultError, NotReadyError, PoseLostError
@@ -15,10 +16,9 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, Observation
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from carlab.experiment.episodes.episode import EpisodeHooks, first_observation, run_episode
+from carlab.experiment.episodes.episode import EpisodeHooks, first_observation
 from sim_backends.simulated_car import SimulatedCar
 
-PERIOD_S = 1.0 / 30.0
 TICKS = 3
 
 
@@ -103,15 +103,7 @@ def drive(
 
     hooks = EpisodeHooks(emit, counted("stop_requested"), counted("recorder_failed"), counted("heartbeat"))
     try:
-        run_episode(
-            car,
-            FaultyPolicy(injector) if policy is None else policy,
-            ParkingTask(),
-            SafetyEnvelope(),
-            period_s=PERIOD_S,
-            max_ticks=TICKS,
-            hooks=hooks,
-        )
+        drive_episode(car, FaultyPolicy(injector) if policy is None else policy, max_ticks=TICKS, hooks=hooks)
     except BaseException as error:
         return documents, error
     return documents, None
@@ -287,14 +279,7 @@ def test_missing_first_pose_ends_with_pose_stale_and_latches_no_fault() -> None:
     documents: list[Document] = []
     with BlindCar(1e9) as car:
         with pytest.raises(PoseLostError):
-            run_episode(
-                car,
-                FaultyPolicy(FaultInjector()),
-                ParkingTask(),
-                SafetyEnvelope(),
-                period_s=PERIOD_S,
-                hooks=EpisodeHooks(emit=documents.append),
-            )
+            drive_episode(car, FaultyPolicy(FaultInjector()), hooks=EpisodeHooks(emit=documents.append))
         assert car.stops == [True]
     assert isinstance(documents[-1], EpisodeEnded)
     assert documents[-1].reason is EndReason.POSE_STALE
@@ -304,12 +289,9 @@ def test_missing_first_pose_ends_with_pose_stale_and_latches_no_fault() -> None:
 def test_failed_recorder_ends_the_episode() -> None:
     injector = FaultInjector()
     with FaultyCar(injector) as car:
-        data = run_episode(
+        data = drive_episode(
             car,
             FaultyPolicy(injector),
-            ParkingTask(),
-            SafetyEnvelope(),
-            period_s=PERIOD_S,
             hooks=EpisodeHooks(
                 recorder_failed=lambda: "the disk is full" if injector.calls.get("act", -1) == 6 else None
             ),
@@ -323,15 +305,7 @@ def test_heartbeat_names_every_step_of_a_tick() -> None:
     """A step without a heartbeat of its own would be reported under the name of the step before it."""
     beats: list[str] = []
     with FaultyCar(FaultInjector()) as car:
-        run_episode(
-            car,
-            FaultyPolicy(car.injector),
-            ParkingTask(),
-            SafetyEnvelope(),
-            period_s=PERIOD_S,
-            max_ticks=2,
-            hooks=EpisodeHooks(heartbeat=beats.append),
-        )
+        drive_episode(car, FaultyPolicy(car.injector), max_ticks=2, hooks=EpisodeHooks(heartbeat=beats.append))
     tick = ["inside the policy 'faulty'", "commanding", "waiting for the next tick", "observing"]
     assert beats == ["waiting for the first pose", "arming", "observing", *tick, *tick, "stopping the car"]
 
@@ -346,12 +320,10 @@ class CoarseCar(FaultyCar):
 def test_recording_and_transitions_hold_the_sent_command() -> None:
     documents: list[Document] = []
     with CoarseCar(FaultInjector()) as car:
-        data = run_episode(
+        data = drive_episode(
             car,
             FaultyPolicy(car.injector, lambda view: Action(0.234, 0.9)),
-            ParkingTask(),
-            SafetyEnvelope(max_throttle=0.46),
-            period_s=PERIOD_S,
+            envelope=SafetyEnvelope(max_throttle=0.46),
             max_ticks=5,
             hooks=EpisodeHooks(emit=documents.append),
         )
@@ -377,7 +349,7 @@ def drive_with_policy_times(times_in_periods: Callable[[int], float]) -> tuple[s
             return Action()
 
         policy = FaultyPolicy(car.injector, act_slowly)
-        data = run_episode(car, policy, ParkingTask(), SafetyEnvelope(), period_s=PERIOD_S, max_ticks=100)
+        data = drive_episode(car, policy, max_ticks=100)
         return data.metadata["end_reason"], data.ticks
 
 

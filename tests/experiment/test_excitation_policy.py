@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from episodes import PERIOD_S, drive_episode
 
 import carlab
 from carlab.core.episode_data import EpisodeData
@@ -13,12 +14,10 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Observation
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import RecordedTask
-from carlab.experiment.episodes.episode import run_episode
 from carlab.experiment.episodes.excitation_policy import ExcitationPolicy
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.simulated_car import SimulatedCar
 
-PERIOD_S = 1.0 / 30.0
 HALF_M = 1.5
 ENVELOPE = SafetyEnvelope(arena_m=rectangle(-HALF_M, HALF_M, -HALF_M, HALF_M))
 REALITIES = {
@@ -36,9 +35,7 @@ def drive(
     policy = policy or ExcitationPolicy(SimulatorConfig(), envelope)
     with SimulatedCar(reality, seed=0) as car:
         car.place(CarState())
-        return run_episode(
-            car, policy, RecordedTask(CarState(), ticks), envelope, period_s=PERIOD_S, max_ticks=ticks
-        )  # fmt: skip
+        return drive_episode(car, policy, RecordedTask(CarState(), ticks), envelope, max_ticks=ticks)
 
 
 @pytest.mark.parametrize("name", REALITIES)

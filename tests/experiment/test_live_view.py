@@ -103,14 +103,12 @@ class Drifting(StatelessModel):
 
 def test_predicted_path_follows_the_policy_with_the_spread_of_the_model() -> None:
     start = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [2.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
-    ahead = predict_ahead(
+    mean, across_std = predict_ahead(
         Drifting(), lambda inputs: np.full((len(inputs), 2), 3.0, np.float32), start, 0.1, n_samples=4000
     )
     steps = np.arange(11)
-    np.testing.assert_allclose(
-        ahead.mean[:, :, 0], [steps, 2.0 + steps], atol=1e-5, err_msg="commands are clipped to 1"
-    )
-    np.testing.assert_allclose(ahead.across_std, [0.01 * np.sqrt(steps)] * 2, rtol=0.06, atol=1e-6)
+    np.testing.assert_allclose(mean[:, :, 0], [steps, 2.0 + steps], atol=1e-5, err_msg="commands are clipped to 1")
+    np.testing.assert_allclose(across_std, [0.01 * np.sqrt(steps)] * 2, rtol=0.06, atol=1e-6)
 
 
 @pytest.mark.parametrize(

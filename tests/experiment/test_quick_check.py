@@ -9,6 +9,7 @@ from pathlib import Path
 
 import parking_drives as drives
 import pytest
+import tomli_w
 
 from carlab.cars import choose_car
 from carlab.core.errors import DataError
@@ -61,7 +62,7 @@ def test_failed_check_is_reported_in_one_sentence_and_not_repeated(tmp_path: Pat
     assert "\n" not in sentence
     assert json.loads(check_path(run, 1).read_text())["verdict"] == "failed", "a failed check is not repeated"
     with pytest.raises(DataError):
-        check(run.path, run.recordings(), SIMULATOR)
+        check(run.path, run.recordings(), tomli_w.dumps(SIMULATOR.to_tables()))
 
 
 def test_stopped_check_writes_nothing_and_is_repeated(tmp_path: Path) -> None:

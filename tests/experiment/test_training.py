@@ -210,7 +210,7 @@ def test_horizon_and_bonus_of_a_second_are_the_same_at_each_rate(
 
     monkeypatch.setattr(SacAgent, "train", train_policy)
     rows = Transitions(np.zeros((1, 5 + 2 * HISTORY)), np.zeros((1, 6)), np.zeros(1), np.zeros(1), HISTORY)
-    env, _ = training._environments(plan, linear_car(None, rows, 1, 0), [], ENVELOPE, 0)
+    env, *_ = training._environments(plan, linear_car(None, rows, 1, 0), [], ENVELOPE, 0)
     with pytest.raises(DataError, match="policy is not needed"):
         training._trained_policy(plan, env, env, None, 1, lambda *what: None)
     assert discounts == [pytest.approx(0.99 ** (30.0 / rate_hz))]

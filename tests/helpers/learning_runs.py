@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -73,6 +74,15 @@ class InterruptedRun:
     files_after_kill: list[str] = field(default_factory=list)
     error_text: str = ""
     first_model: bytes = b""
+
+    def copied(self, folder: Path, *models: str, recordings: bool = False) -> RunDirectory:
+        """A new run in ``folder`` with these models, and with the recordings, of this run."""
+        run = RunDirectory.create(folder, "copied")
+        for model in models:
+            shutil.copytree(self.run.models / model, run.models / model)
+        for recording in self.run.recordings() if recordings else ():
+            shutil.copy(recording, run.episodes)
+        return run
 
 
 def log_sent_actions(choice: CarChoice) -> list[Action]:

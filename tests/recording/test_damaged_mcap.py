@@ -16,12 +16,13 @@ from carlab.core.errors import DataError
 from carlab.recording.episode_builder import episode_from_documents
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_episode, read_recording
+from tests.helpers.episode_documents import make_documents
 
 TICKS = 90
 
 
 @pytest.fixture
-def path(tmp_path, make_documents):
+def path(tmp_path):
     """A complete recording with a chunk for each 12 documents."""
     sink = McapSink(tmp_path / "0001.mcap")
     sink.open()
@@ -128,7 +129,7 @@ def test_beginning_and_end_alone_are_refused(path):
 
 
 @pytest.mark.parametrize("lost_transitions", [0, 3])
-def test_final_state_keeps_its_time_if_the_last_ticks_are_lost(make_documents, lost_transitions):
+def test_final_state_keeps_its_time_if_the_last_ticks_are_lost(lost_transitions):
     documents = make_documents(60)
     complete = episode_from_documents(documents)
     remaining = [

@@ -1,10 +1,9 @@
 """The audit finds injected faults and proposes the option that repairs them; real recordings have the known faults."""
 
-import importlib.util
 import json
 import math
-from pathlib import Path
 
+import foreign_drive as foreign
 import numpy as np
 import pytest
 
@@ -15,10 +14,6 @@ from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.faults.pose import rows_off_path
 from carlab.recording.pose_velocity import pose_jumps
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
 
 RNG = np.random.default_rng(5)
 UNEVEN = np.arange(1200) / 40.0 + RNG.uniform(-0.002, 0.002, 1200)

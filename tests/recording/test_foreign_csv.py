@@ -1,9 +1,8 @@
 """Import of foreign CSV files: files with exactly known values, and refusal of each kind of invalid input."""
 
 import gzip
-import importlib.util
-from pathlib import Path
 
+import foreign_drive as foreign
 import numpy as np
 import pytest
 
@@ -12,10 +11,6 @@ from carlab.recording.audit.report import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.csv.repairing_import import import_repaired
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
 
 EVEN = np.arange(900) / 30.0
 

@@ -4,10 +4,9 @@ Cases are drawn with a fixed seed; the file name in a message contains the numbe
 """
 
 import gzip
-import importlib.util
 import json
-from pathlib import Path
 
+import foreign_drive as foreign
 import numpy as np
 import pytest
 from mcap.writer import Writer
@@ -19,10 +18,7 @@ from carlab.recording.mcap.messages import ended_to_metadata, started_to_metadat
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.recorder import Recorder
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
+from tests.helpers.episode_documents import make_documents
 
 CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "true", "x", '"', "9" * 400, "\x00", "1,2", "0x1f"]
 JSON_TEXTS = ["", "null", "3", "[]", "[1]", "{}", '"a"', "[[1]]", "[[1, 2, 3]]", "[null, 1, 2]", "[" * 100_000, "nan"]
@@ -120,7 +116,7 @@ def metadata_file(path, record, config=b""):
 
 
 class TestMcap:
-    def test_damaged_mcap_is_read_or_refused(self, make_documents, tmp_path):
+    def test_damaged_mcap_is_read_or_refused(self, tmp_path):
         rng = np.random.default_rng(4)
         complete = tmp_path / "complete.mcap"
         with Recorder([McapSink(complete)]) as recorder:
@@ -132,7 +128,7 @@ class TestMcap:
             path.write_bytes(damaged(rng, content))
             refusal(read_episode, path)
 
-    def test_metadata_of_another_type_is_refused_with_the_name_of_the_file(self, make_documents, tmp_path):
+    def test_metadata_of_another_type_is_refused_with_the_name_of_the_file(self, tmp_path):
         documents = make_documents(3)
         record = {**started_to_metadata(documents[0]), **ended_to_metadata(documents[-1])}
         for key in ("episode", "start_t_s", "reality", "goal", "arena_m", "end_reason", "statistics"):
@@ -143,17 +139,17 @@ class TestMcap:
                 assert str(path) in message, (key, text[:20])
                 assert len(message) < 600, (key, text[:20])
 
-    def test_configuration_that_is_not_text_is_refused(self, make_documents, tmp_path):
+    def test_configuration_that_is_not_text_is_refused(self, tmp_path):
         path = metadata_file(tmp_path / "c.mcap", started_to_metadata(make_documents(3)[0]), b"\xff\xfe")
         assert str(path) in refusal(read_episode, path)
 
-    def test_goal_with_too_few_numbers_is_refused(self, make_documents, tmp_path):
+    def test_goal_with_too_few_numbers_is_refused(self, tmp_path):
         record = started_to_metadata(make_documents(3)[0]) | {"goal": json.dumps([1.0])}
         message = refusal(read_episode, metadata_file(tmp_path / "goal.mcap", record))
         assert schemas.EPISODE_RECORD in message
 
     @pytest.mark.parametrize("text", ["[1]", "3", "null", '{"a": "b"}', '{"a": null}', '{"a": [1]}'])
-    def test_statistics_that_are_not_numbers_are_refused(self, make_documents, tmp_path, monkeypatch, text):
+    def test_statistics_that_are_not_numbers_are_refused(self, tmp_path, monkeypatch, text):
         path = recording_with(tmp_path / "end.mcap", make_documents(3), monkeypatch, "statistics", text)
         message = refusal(read_episode, path)
         assert message is not None

@@ -1,18 +1,12 @@
 """The column ``segment`` of a recording numbers the parts between gaps; a column of a file keeps its own values."""
 
-import importlib.util
-from pathlib import Path
-
+import foreign_drive as foreign
 import numpy as np
 import pytest
 
 from carlab.recording.column_mapping import CANONICAL
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
 
 KEEP = CANONICAL.with_options(gaps="keep")
 SPLIT = CANONICAL.with_options(gaps="split")

@@ -1,9 +1,8 @@
 """Velocities of imported recordings: which columns are used, and by which clock the pose is differentiated."""
 
-import importlib.util
 import tracemalloc
-from pathlib import Path
 
+import foreign_drive as foreign
 import numpy as np
 import pytest
 
@@ -15,10 +14,6 @@ from carlab.recording.faults import robust
 from carlab.recording.pose_velocity import pose_motion
 from sim_backends.array_ops import FLOATS
 from sim_backends.measurement import windowed
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
 
 
 @pytest.mark.parametrize("option", [{"velocities": "pose"}, {}])

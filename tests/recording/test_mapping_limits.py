@@ -1,9 +1,8 @@
 """Declarations of a mapping that would replace or confuse data are refused in one sentence with the remedy."""
 
-import importlib.util
 from dataclasses import replace
-from pathlib import Path
 
+import foreign_drive as foreign
 import numpy as np
 import pytest
 
@@ -11,10 +10,6 @@ import carlab
 from carlab.core.errors import ConfigError, DataError
 from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD, load_mapping, recognise_layout
 from carlab.recording.csv.foreign import import_csv
-
-_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
-foreign = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(foreign)
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ from carlab.recording.mcap import schemas as schemas
 from carlab.recording.mcap.sink import McapSink, write_episode
 from carlab.recording.mcap.source import read_documents, read_episode, read_recording
 from carlab.recording.recorder import Recorder
+from tests.helpers.episode_documents import make_documents
 
 RERUN = Path(sys.executable).with_name("rerun")
 
@@ -51,7 +52,7 @@ def comparable(value):
     return value
 
 
-def test_every_document_reads_back_exactly(tmp_path, make_documents):
+def test_every_document_reads_back_exactly(tmp_path):
     documents = make_documents(70)
     path = record(tmp_path / "0001.mcap", documents)
     assert [comparable(d) for d in read_documents(path)] == [comparable(d) for d in documents]
@@ -87,7 +88,7 @@ def test_any_number_and_text_reads_back_exactly(tmp_path_factory, numbers, times
     assert [comparable(d) for d in read_documents(path)] == [comparable(d) for d in documents]
 
 
-def test_arrays_equal_the_documents(tmp_path, make_documents):
+def test_arrays_equal_the_documents(tmp_path):
     documents = make_documents(40)
     ticks = [d for d in documents if isinstance(d, Tick)]
     path = record(tmp_path / "0001.mcap", documents, {"git": "abc", "host": "lab"})
@@ -114,7 +115,7 @@ def test_arrays_equal_the_documents(tmp_path, make_documents):
     assert "recovered" not in episode.metadata
 
 
-def test_independent_reader_decodes_messages_units_and_times(tmp_path, make_documents):
+def test_independent_reader_decodes_messages_units_and_times(tmp_path):
     documents = make_documents(10)
     path = record(tmp_path / "0001.mcap", documents)
     messages: dict[str, list] = {}
@@ -171,13 +172,13 @@ def test_field_numbers_are_unique():
 
 
 @pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed beside this Python")
-def test_rerun_accepts_the_file(tmp_path, make_documents):
+def test_rerun_accepts_the_file(tmp_path):
     path = record(tmp_path / "0001.mcap", make_documents(30))
     check = subprocess.run([RERUN, "mcap", "check", path], capture_output=True, text=True, check=False)
     assert check.returncode == 0, check.stdout + check.stderr
 
 
-def test_truncated_file_gives_its_complete_ticks_or_one_sentence(tmp_path, make_documents):
+def test_truncated_file_gives_its_complete_ticks_or_one_sentence(tmp_path):
     documents = make_documents(90)
     sink = McapSink(tmp_path / "complete.mcap")
     sink.open()
@@ -208,7 +209,7 @@ def test_truncated_file_gives_its_complete_ticks_or_one_sentence(tmp_path, make_
     assert len(set(recovered)) > 5
 
 
-def test_damaged_byte_never_gives_wrong_numbers(tmp_path, make_documents):
+def test_damaged_byte_never_gives_wrong_numbers(tmp_path):
     path = record(tmp_path / "0001.mcap", make_documents(60))
     complete = path.read_bytes()
     original = read_episode(path)
@@ -256,7 +257,7 @@ def test_mcap_of_another_program_is_refused(tmp_path):
         read_episode(path)
 
 
-def test_missing_file_and_folder_are_refused(tmp_path, make_documents):
+def test_missing_file_and_folder_are_refused(tmp_path):
     with pytest.raises(DataError, match="does not exist"):
         read_episode(tmp_path / "0001.mcap")
     with pytest.raises(DataError, match="folder"):
@@ -266,16 +267,16 @@ def test_missing_file_and_folder_are_refused(tmp_path, make_documents):
         read_episode(tmp_path / "0001.mcap")
 
 
-def test_episode_without_a_tick_is_refused_with_its_end_reason(tmp_path, make_documents):
+def test_episode_without_a_tick_is_refused_with_its_end_reason(tmp_path):
     started = make_documents(1)[0]
     ended = EpisodeEnded(started.t_s, EndReason.CRASHED, "No pose came.", 0, 0.0)
     path = record(tmp_path / "0001.mcap", [started, ended])
-    assert read_recording(path).recovered is False
+    assert read_recording(path).defect is None
     with pytest.raises(DataError, match=r"0001\.mcap holds no complete tick .*No pose came"):
         read_episode(path)
 
 
-def test_command_without_a_following_observation_is_dropped(tmp_path, make_documents):
+def test_command_without_a_following_observation_is_dropped(tmp_path):
     documents = make_documents(20)
     # The car failed after the 20th command: its transition is missing and `last` is the observation of that tick.
     last_tick = [d for d in documents if isinstance(d, Tick)][-1]

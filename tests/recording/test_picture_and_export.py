@@ -18,10 +18,11 @@ from carlab.recording.atomic_files import write_text
 from carlab.recording.csv.export import table_of, write_csv, write_parquet
 from carlab.recording.episode_builder import episode_from_documents, goal_of, polygon_of
 from carlab.recording.picture import outline, save_summary
+from tests.helpers.episode_documents import make_documents
 
 
 @pytest.fixture
-def episode(make_documents):
+def episode():
     return episode_from_documents(make_documents(60))
 
 

@@ -21,6 +21,7 @@ from carlab.recording.mcap.source import read_documents, read_episode, read_reco
 from carlab.recording.recorder import Recorder
 from carlab.recording.rerun.sink import RerunSink
 from carlab.recording.sink import Sink
+from tests.helpers.episode_documents import make_documents
 
 
 class MemorySink(Sink):
@@ -52,7 +53,7 @@ class MemorySink(Sink):
         self.complete = True
 
 
-def test_documents_reach_every_sink_in_order_and_sinks_are_finished(make_documents):
+def test_documents_reach_every_sink_in_order_and_sinks_are_finished():
     documents = make_documents(30)
     first, second = MemorySink(), MemorySink()
     with Recorder([first, second]) as recorder:
@@ -75,7 +76,7 @@ def test_constructor_starts_no_thread_and_writes_no_file(tmp_path):
         recorder.emit(SafetyEvent(0.0, "clip", ""))
 
 
-def test_blocked_sink_blocks_no_emit_and_loses_no_event(make_documents):
+def test_blocked_sink_blocks_no_emit_and_loses_no_event():
     gate = threading.Event()
     blocked = MemorySink(gate)
     recorder = Recorder([blocked], capacity=50)
@@ -111,7 +112,7 @@ def test_blocked_sink_blocks_no_emit_and_loses_no_event(make_documents):
     )
 
 
-def test_close_ends_and_reports_a_disk_that_hangs(make_documents):
+def test_close_ends_and_reports_a_disk_that_hangs():
     gate = threading.Event()
     recorder = Recorder([MemorySink(gate)])
     recorder.open()
@@ -130,7 +131,7 @@ def test_close_ends_and_reports_a_disk_that_hangs(make_documents):
         (ValueError("a bug"), "a bug", True),
     ],
 )
-def test_failed_sink_is_closed_and_the_others_continue(make_documents, caplog, error, message, finished):
+def test_failed_sink_is_closed_and_the_others_continue(caplog, error, message, finished):
     documents = make_documents(20)
     failing, intact = MemorySink(error=error, at=9), MemorySink()
     with caplog.at_level(logging.CRITICAL), Recorder([failing, intact]) as recorder:
@@ -144,7 +145,7 @@ def test_failed_sink_is_closed_and_the_others_continue(make_documents, caplog, e
         assert not failing.complete
 
 
-def test_full_disk_leaves_a_readable_partial_file(tmp_path, make_documents, monkeypatch):
+def test_full_disk_leaves_a_readable_partial_file(tmp_path, monkeypatch):
     sink = McapSink(tmp_path / "0001.mcap")
     documents = make_documents(60)
     sink.open()
@@ -174,7 +175,7 @@ def test_full_disk_leaves_a_readable_partial_file(tmp_path, make_documents, monk
     assert episode.metadata["end_reason"] == "CRASHED"
 
 
-def test_file_that_cannot_be_created_is_reported_when_the_recorder_opens(tmp_path, make_documents):
+def test_file_that_cannot_be_created_is_reported_when_the_recorder_opens(tmp_path):
     (tmp_path / "taken").write_text("")
     (tmp_path / "0002.mcap").write_text("")
     first = McapSink(tmp_path / "0001.mcap")
@@ -197,7 +198,7 @@ def test_disk_without_space_is_reported_when_the_recorder_opens(tmp_path, monkey
     assert list(tmp_path.iterdir()) == []
 
 
-def test_close_without_an_end_marks_the_file_as_crashed(tmp_path, make_documents):
+def test_close_without_an_end_marks_the_file_as_crashed(tmp_path):
     path = tmp_path / "0001.mcap"
 
     def loop():
@@ -216,7 +217,7 @@ def test_close_without_an_end_marks_the_file_as_crashed(tmp_path, make_documents
     assert read_documents(path)[-1].total_reward == pytest.approx(sum(0.1 * k for k in range(30)))
 
 
-def test_first_end_is_kept_and_finishes_the_file_while_the_loop_hangs(tmp_path, make_documents):
+def test_first_end_is_kept_and_finishes_the_file_while_the_loop_hangs(tmp_path):
     path = tmp_path / "0001.mcap"
     documents = make_documents(30)
     recorder = Recorder([McapSink(path)])
@@ -239,7 +240,7 @@ def test_first_end_is_kept_and_finishes_the_file_while_the_loop_hangs(tmp_path, 
     assert sum(isinstance(d, EpisodeEnded) for d in read_documents(path)) == 1
 
 
-def test_log_lines_and_early_events_are_recorded(tmp_path, make_documents):
+def test_log_lines_and_early_events_are_recorded(tmp_path):
     path = tmp_path / "0001.mcap"
     documents = make_documents(5)
     logger = logging.getLogger("carlab.test_recording")
@@ -265,17 +266,14 @@ def test_log_lines_and_early_events_are_recorded(tmp_path, make_documents):
 
 
 WRITER = """
-import sys, time, types
-import importlib.util
-spec = importlib.util.spec_from_file_location("documents_of_a_test", sys.argv[1])
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
+import sys, time
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.recorder import Recorder
 from carlab.core.documents import Tick
-recorder = Recorder([McapSink(sys.argv[2])])
+from tests.helpers.episode_documents import documents
+recorder = Recorder([McapSink(sys.argv[1])])
 recorder.open()
-for document in module._documents(100000, end=False):
+for document in documents(100000, end=False):
     recorder.emit(document)
     if isinstance(document, Tick):
         print(document.step, time.monotonic(), flush=True)
@@ -284,10 +282,9 @@ for document in module._documents(100000, end=False):
 
 
 @pytest.mark.realtime
-def test_sigkill_loses_at_most_half_a_second(tmp_path, request):
+def test_sigkill_loses_at_most_half_a_second(tmp_path):
     path = tmp_path / "0001.mcap"
-    conftest = request.path.with_name("conftest.py")
-    command = [sys.executable, "-c", WRITER, str(conftest), str(path)]
+    command = [sys.executable, "-c", WRITER, str(path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
         emitted = []
         for line in child.stdout:
@@ -310,18 +307,15 @@ def test_sigkill_loses_at_most_half_a_second(tmp_path, request):
 
 WRITER_WITH_SIZE_LIMIT = """
 import resource, sys
-import importlib.util
-spec = importlib.util.spec_from_file_location("documents_of_a_test", sys.argv[1])
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.recorder import Recorder
 from carlab.recording.rerun.sink import RerunSink
-folder = sys.argv[2]
+from tests.helpers.episode_documents import documents
+folder = sys.argv[1]
 recorder = Recorder([McapSink(folder + "/1.mcap"), RerunSink(folder + "/1.rrd"), McapSink(folder + "/2.mcap")])
 recorder.open()
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
-for document in module._documents(900):
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+for document in documents(900):
     recorder.emit(document)
 recorder.close()
 print(recorder.failed)
@@ -329,15 +323,8 @@ print(recorder.failed)
 
 
 @pytest.mark.parametrize("max_bytes", [40_000, 150_000])
-def test_file_size_limit_gives_one_sentence_and_readable_partial_files(tmp_path, request, max_bytes):
-    command = [
-        sys.executable,
-        "-c",
-        WRITER_WITH_SIZE_LIMIT,
-        str(request.path.with_name("conftest.py")),
-        str(tmp_path),
-        str(max_bytes),
-    ]
+def test_file_size_limit_gives_one_sentence_and_readable_partial_files(tmp_path, max_bytes):
+    command = [sys.executable, "-c", WRITER_WITH_SIZE_LIMIT, str(tmp_path), str(max_bytes)]
     writer = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     assert " could not be written: File too large" in writer.stdout
     assert "Traceback" not in writer.stdout + writer.stderr
@@ -345,7 +332,7 @@ def test_file_size_limit_gives_one_sentence_and_readable_partial_files(tmp_path,
     assert read_episode(tmp_path / "1.mcap.partial").ticks > 10
 
 
-def test_sinks_are_flushed_periodically_without_new_documents(make_documents):
+def test_sinks_are_flushed_periodically_without_new_documents():
     sink = MemorySink()
     with Recorder([sink], flush_interval_s=0.01) as recorder:
         recorder.emit(make_documents(1)[0])

@@ -29,7 +29,7 @@ def test_rows_with_missing_and_with_too_large_cells_are_dropped(
     path.write_text("\n".join([header, *(",".join(r) for r in rows)]) + "\n", encoding="utf-8")
     read = import_repaired(path)
     assert [f.id for f in read.repaired] == ["not_a_number", "not_a_number"]
-    assert len(read.imported.episode.times_s) == len(rows) - 2
+    assert len(read.episode.times_s) == len(rows) - 2
 
 
 def test_drives_that_are_years_apart_are_read_as_one_file(tmp_path: Path) -> None:
@@ -44,7 +44,7 @@ def test_drives_that_are_years_apart_are_read_as_one_file(tmp_path: Path) -> Non
         for row in rows[len(rows) // 2 :]:
             row[column] = repr(float(row[column]) + gap_s)
         path.write_text("\n".join([header, *(",".join(r) for r in rows)]) + "\n", encoding="utf-8")
-        report = import_repaired(path).imported.report
+        report = import_repaired(path).report
         assert len(report.of("dropouts")) == 1
         delays.append([finding.evidence["delay_s"] for finding in report.of("command_delay")])
     assert len(delays[0]) == 2

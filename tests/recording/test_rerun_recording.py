@@ -17,6 +17,7 @@ from carlab.recording.recorder import Recorder
 from carlab.recording.rerun import blueprint
 from carlab.recording.rerun.screenshot import has_vulkan_driver, save_screenshot
 from carlab.recording.rerun.sink import RerunSink, episode_to_rrd
+from tests.helpers.episode_documents import make_documents
 from tests.helpers.rerun_files import BlueprintView, entities, tabs, views
 
 RERUN = Path(sys.executable).with_name("rerun")
@@ -61,7 +62,7 @@ def verify(path):
 
 
 @needs_rerun
-def test_live_recording_is_valid_and_has_the_entities_of_the_layout(tmp_path, make_documents):
+def test_live_recording_is_valid_and_has_the_entities_of_the_layout(tmp_path):
     path = record(tmp_path / "0001.rrd", make_documents(60))
     assert [p.name for p in tmp_path.iterdir()] == ["0001.rrd"]
     verify(path)
@@ -78,7 +79,7 @@ def has_data(view: BlueprintView, logged: set[str]) -> bool:
     return any(path == q or path.startswith(f"{q}/") for path in logged for q in queried or [view.origin.strip("/")])
 
 
-def test_layout_of_a_complete_file_has_no_panel_without_data(tmp_path, make_documents):
+def test_layout_of_a_complete_file_has_no_panel_without_data(tmp_path):
     episode = dataclasses.replace(episode_from_documents(make_documents(20)), rewards=np.full(20, np.nan), extra={})
     path = tmp_path / "arrays.rrd"
     episode_to_rrd(episode, path)
@@ -92,7 +93,7 @@ def test_layout_of_a_complete_file_has_no_panel_without_data(tmp_path, make_docu
     assert all(has_data(view, LIVE) for view in views(full))
 
 
-def test_values_and_times_equal_the_emitted_ones(tmp_path, make_documents):
+def test_values_and_times_equal_the_emitted_ones(tmp_path):
     documents = make_documents(60)
     episode = episode_from_documents(documents)
     rows = rows_of(record(tmp_path / "0001.rrd", documents))
@@ -117,7 +118,7 @@ def test_values_and_times_equal_the_emitted_ones(tmp_path, make_documents):
 
 
 @needs_rerun
-def test_converted_episode_has_the_entities_of_a_live_one_and_its_overlays(tmp_path, make_documents):
+def test_converted_episode_has_the_entities_of_a_live_one_and_its_overlays(tmp_path):
     episode = episode_from_documents(make_documents(60))
     predicted = episode.states + 0.1
     predicted[:4] = np.nan
@@ -154,7 +155,7 @@ def properties(path):
     return {name: value for name, (_, value) in newest.items()}
 
 
-def test_end_reason_and_car_are_properties(tmp_path, make_documents):
+def test_end_reason_and_car_are_properties(tmp_path):
     ended = properties(record(tmp_path / "ended.rrd", make_documents(5)))
     expected = {
         "reality": "emulated",
@@ -169,7 +170,7 @@ def test_end_reason_and_car_are_properties(tmp_path, make_documents):
     assert crashed["reason"] == "CRASHED"
 
 
-def test_end_reason_of_a_killed_recording_is_crashed(tmp_path, make_documents):
+def test_end_reason_of_a_killed_recording_is_crashed(tmp_path):
     sink = RerunSink(tmp_path / "0001.rrd")
     sink.open()
     for document in make_documents(20, end=False):
@@ -186,7 +187,7 @@ def test_end_reason_of_a_killed_recording_is_crashed(tmp_path, make_documents):
 
 
 @needs_rerun
-def test_episode_without_a_tick_is_a_valid_file(tmp_path, make_documents):
+def test_episode_without_a_tick_is_a_valid_file(tmp_path):
     started = make_documents(1)[0]
     documents = [
         started,
@@ -198,7 +199,7 @@ def test_episode_without_a_tick_is_a_valid_file(tmp_path, make_documents):
 
 @pytest.mark.skipif(not has_vulkan_driver(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)")
 @needs_rerun
-def test_screenshot_is_made_without_a_window_and_the_viewer_ends(tmp_path, make_documents):
+def test_screenshot_is_made_without_a_window_and_the_viewer_ends(tmp_path):
     path = record(tmp_path / "0001.rrd", make_documents(60))
     save_screenshot(path, tmp_path / "picture.png", size=(800, 600))
     data = (tmp_path / "picture.png").read_bytes()

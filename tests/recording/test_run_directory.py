@@ -14,14 +14,11 @@ from carlab.recording.run_folder import RunDirectory, environment, git_state
 
 
 def test_new_run_has_its_folders_configuration_and_environment(tmp_path):
-    run = RunDirectory.create(
-        tmp_path / "runs", "Parking in the lab!", config_toml="seed = 3\n", metadata={"note": "n"}
-    )
+    run = RunDirectory.create(tmp_path / "runs", "Parking in the lab!", config_toml="seed = 3\n")
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d{6}_Parking-in-the-lab", run.path.name)
     assert {p.name for p in run.path.iterdir()} == {"config.toml", "environment.json", "episodes"}
     assert run.config_toml == "seed = 3\n"
     environment_file = json.loads((run.path / "environment.json").read_text())
-    assert environment_file["note"] == "n"
     assert environment_file["packages"].keys() >= {"numpy", "mcap"}
     assert environment_file["python"].startswith("3.")
     assert RunDirectory.open_existing(run.path).path == run.path
@@ -78,7 +75,7 @@ def test_log_has_one_json_object_per_line(tmp_path):
 
 def test_result_is_written_without_a_partial_file(tmp_path):
     run = RunDirectory.create(tmp_path, "result")
-    run.write_result({"episodes": 3, "path": tmp_path})
+    run.write_json("result.json", {"episodes": 3, "path": tmp_path})
     assert json.loads((run.path / "result.json").read_text()) == {"episodes": 3, "path": str(tmp_path)}
     assert not list(run.path.glob("*.partial"))
 

@@ -15,6 +15,7 @@ from carlab.recording.atomic_files import rerun_file
 from carlab.recording.episode_builder import episode_from_documents
 from carlab.recording.rerun.blueprint import send_blueprint
 from carlab.recording.rerun.run_recording import PAUSE_S, RunRecording
+from tests.helpers.episode_documents import make_documents
 from tests.helpers.rerun_files import cells, tabs, views
 
 TICKS = 12
@@ -34,7 +35,7 @@ def mean_and_std():
 
 
 @pytest.fixture
-def run_file(tmp_path: Path, make_documents, mean_and_std) -> Path:
+def run_file(tmp_path: Path, mean_and_std) -> Path:
     """Two episodes; the second has predictions, figures and a check."""
     documents = make_documents(TICKS)
     with rerun_file(tmp_path / "run.rrd") as stream:
@@ -53,7 +54,7 @@ def run_file(tmp_path: Path, make_documents, mean_and_std) -> Path:
     return tmp_path / "run.rrd"
 
 
-def test_episodes_follow_each_other_and_no_line_joins_them(run_file: Path, make_documents) -> None:
+def test_episodes_follow_each_other_and_no_line_joins_them(run_file: Path) -> None:
     documents = make_documents(TICKS)
     episode = episode_from_documents(documents)
     relative_s = episode.times_s - documents[0].t_s
@@ -101,7 +102,7 @@ def test_predictions_and_figures_are_written_with_their_bands(run_file: Path, me
     assert cells(run_file, "TextLog:text", "episode")["check"] == [(2, ["Episode 2: The simulator explains it."])]
 
 
-def test_layout_has_the_tabs_and_panels_with_data(run_file: Path, tmp_path: Path, make_documents) -> None:
+def test_layout_has_the_tabs_and_panels_with_data(run_file: Path, tmp_path: Path) -> None:
     learning = {"Drive by episode", "Predicted against driven", "Learning curve", "Quick check", "Latency and health"}
     assert set(tabs(run_file)) == learning
     names = [view.name for view in views(run_file)]
@@ -115,7 +116,7 @@ def test_layout_has_the_tabs_and_panels_with_data(run_file: Path, tmp_path: Path
     assert set(tabs(tmp_path / "drive.rrd")) == {"Drive by episode", "Latency and health"}
 
 
-def test_number_of_an_episode_of_learning_is_that_of_its_model(tmp_path: Path, make_documents) -> None:
+def test_number_of_an_episode_of_learning_is_that_of_its_model(tmp_path: Path) -> None:
     first, *others = make_documents(3)
     for model, expected in (("3", 3), ("9" * 5000, first.episode), ("x", first.episode)):
         with rerun_file(tmp_path / "run.rrd") as stream:

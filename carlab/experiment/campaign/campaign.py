@@ -224,10 +224,8 @@ class Campaign:
         return PriorVersion(history=self.plan.history)
 
     def _simulator(self, version: PriorVersion) -> SimulatorConfig:
-        return corrected(self._initial_prior(), version.corrections)
-
-    def _initial_prior(self) -> SimulatorConfig:
-        return SimulatorConfig.from_tables(toml_tables(self.plan.prior_toml))
+        initial = SimulatorConfig.from_tables(toml_tables(self.plan.prior_toml))
+        return corrected(initial, version.corrections)
 
     def _correct_prior(self) -> bool:
         """Correct the prior after the newest episode, unless that is done; False if it was stopped."""
@@ -252,8 +250,7 @@ class Campaign:
     @property
     def _envelope(self) -> SafetyEnvelope:
         """The car's limits; the task's arena if the car has no arena."""
-        envelope = self.choice.envelope
-        return envelope if envelope.arena_m else replace(envelope, arena_m=self.plan.task.arena_m)
+        return self.choice.envelope.with_default_arena(self.plan.task.arena_m)
 
     def _drive(self, number: int) -> EpisodeResult | None:
         agent = SacAgent.load(model_folder(self.run.models, number), SacSettings(), self.plan.seed)

@@ -202,19 +202,6 @@ def predict_windows(dynamics: RolloutModel, episode: EpisodeData) -> WindowPredi
     return WindowPredictions(starts[:, None] + np.arange(length + 1), paths.mean(axis=2), paths.std(axis=2))
 
 
-@dataclass(frozen=True, slots=True)
-class PathsAhead:
-    """Predicted paths of the policy in the learned car.
-
-    Attributes:
-        mean: mean states (S, K + 1, 6), yaw continuous along a path.
-        across_std: standard deviation of the position across the mean heading (S, K + 1) [m].
-    """
-
-    mean: FloatArray
-    across_std: FloatArray
-
-
 def predict_ahead(
     dynamics: RolloutModel,
     act: Callable[[NDArray[np.float32]], NDArray[np.float32]],
@@ -222,7 +209,7 @@ def predict_ahead(
     period_s: float,
     *,
     n_samples: int = 16,
-) -> PathsAhead:
+) -> tuple[FloatArray, FloatArray]:
     """Predict the paths of the next second by a policy in a learned car, without the slew limits of the safety gate.
 
     Args:
@@ -231,6 +218,10 @@ def predict_ahead(
         features: encoded states and past commands at the starts (S, 7 + 2 H).
         period_s: control period [s].
         n_samples: sampled paths from each start.
+
+    Returns:
+        Mean states (S, K + 1, 6), yaw continuous along a path, and standard deviations of the position across the mean
+        heading (S, K + 1) [m].
     """
     generator = torch.Generator().manual_seed(0)
     rows = torch.from_numpy(features).float().repeat_interleave(n_samples, dim=0)
@@ -245,4 +236,4 @@ def predict_ahead(
     mean = paths.mean(axis=1)
     left = np.stack([-np.sin(mean[..., 2]), np.cos(mean[..., 2])], axis=-1)
     across = ((paths[..., :2] - mean[:, None, :, :2]) * left[:, None]).sum(axis=-1)
-    return PathsAhead(mean, across.std(axis=1))
+    return mean, across.std(axis=1)

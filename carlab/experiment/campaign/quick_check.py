@@ -70,7 +70,7 @@ def run_check_subprocess(
     text = tomli_w.dumps(simulator.to_tables())
     try:
         (run.path / SIMULATOR_FILE).write_text(text, encoding="utf-8")
-        result = run_in_child("quick check", _check, (run.path, recordings, text), stop)
+        result = run_in_child("quick check", check, (run.path, recordings, text), stop)
     except (ChildError, OSError) as error:
         if isinstance(error, ChildError) and error.end != "died":
             result = _failed(str(error))
@@ -80,11 +80,7 @@ def run_check_subprocess(
     return None if result is None else EpisodeCheck.from_dict(_saved(path, number, result))
 
 
-def _check(run: Path, recordings: list[Path], simulator_toml: str) -> dict[str, Any]:
-    return check(run, recordings, SimulatorConfig.from_tables(toml_tables(simulator_toml)))
-
-
-def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict[str, Any]:
+def check(run: Path, recordings: list[Path], simulator_toml: str) -> dict[str, Any]:
     """Run the quick check of recordings; returns the content of the file, with the messages.
 
     Raises:
@@ -94,6 +90,7 @@ def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict
     from carlab.diagnosis.quick.sentences import sentences, short
 
     driven = [path for path in recordings if has_ticks(path)]
+    simulator = SimulatorConfig.from_tables(toml_tables(simulator_toml))
     result = quick_check([read_episode(path) for path in driven], simulator)
     decide = f"carlab diagnose decides, from {MIN_DIAGNOSIS_EPISODES} episodes on"
     command = next_step(run)

@@ -52,8 +52,8 @@ class LearnedDriver:
         if not starts:
             return
         features = np.array([tick.features for tick in starts])
-        ahead = predict_ahead(self.dynamics, self.agent.act, features, period_s)
-        for tick, mean, across_std in zip(starts, ahead.mean, ahead.across_std, strict=True):
+        paths = predict_ahead(self.dynamics, self.agent.act, features, period_s)
+        for tick, mean, across_std in zip(starts, *paths, strict=True):
             recording.add_predicted_path(tick.t_s, tick.step, mean, across_std)
 
 

@@ -157,12 +157,12 @@ def train(request: TrainingRequest, progress: Progress) -> dict[str, Any]:
     figures["model_seconds"] = clock.now_s() - began_s
 
     began_s = clock.now_s()
-    environments = _environments(plan, dynamics, usable, request.envelope, seed)
+    training, evaluation, driven = _environments(plan, dynamics, usable, request.envelope, seed)
     agent, policy_figures = _trained_policy(
-        plan, *environments, None if earlier_car is None else earlier, plan.updates_before(number), progress
+        plan, training, evaluation, None if earlier_car is None else earlier, plan.updates_before(number), progress
     )
     figures |= {**policy_figures, "policy_seconds": clock.now_s() - began_s}
-    figures |= _predicted_figures(plan, agent, dynamics, usable, request.envelope, seed)
+    figures |= predicted_figures(plan, agent, driven, usable, request.envelope, seed)
 
     def write(folder: Path) -> None:
         save_car(dynamics, folder / DYNAMICS_FILE)
@@ -196,37 +196,26 @@ def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[st
 
 def _environments(
     plan: TrainingPlan, dynamics: LearnedCar, episodes: list[EpisodeData], envelope: SafetyEnvelope, seed: int
-) -> tuple[ModelEnv, ModelEnv]:
-    """Environments of the learned car for training and for evaluation; the latter has the task's reward alone."""
+) -> tuple[ModelEnv, ModelEnv, ModelEnv]:
+    """Environments of the learned car for training, for evaluation, and with the safety gate of the driven car.
+
+    Only the first one has a reward in addition to that of the task.
+    """
     task = plan.task
-    period_s = plan.control_period_s
     reaction_s = min(envelope.reaction_s + EXTRA_REACTION_S, SAFETY_BOUNDS.deadline.high)
     slow_gate = replace(envelope, reaction_s=reaction_s)
-    gate: dict[str, Any] = {"envelope": slow_gate, "period_s": period_s, "device": plan.device}
+    common: dict[str, Any] = {"period_s": plan.control_period_s, "device": plan.device}
     recorded = recorded_features(episodes, plan.history) if episodes else None
 
     def bonus(features: Tensor) -> Tensor:
         value: Tensor = SUCCESS_BONUS * task.tick_weight * task.success(features).to(features)
         return value - task.cost_weight * task.cost(features) if task.has_constraint else value
 
-    training = ModelEnv(dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, seed=seed, **gate)
-    return training, ModelEnv(dynamics, task, N_EVALUATION_CARS, seed=seed + 1, **gate)
-
-
-def _predicted_figures(
-    plan: TrainingPlan,
-    agent: SacAgent,
-    dynamics: LearnedCar,
-    episodes: list[EpisodeData],
-    envelope: SafetyEnvelope,
-    seed: int,
-) -> dict[str, Any]:
-    """``predicted_figures`` for the learned car with the safety gate of the driven car."""
-    period_s = plan.control_period_s
-    learned = ModelEnv(
-        dynamics, plan.task, N_EVALUATION_CARS, envelope=envelope, period_s=period_s, seed=seed + 2, device=plan.device
+    training = ModelEnv(
+        dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, envelope=slow_gate, seed=seed, **common
     )
-    return predicted_figures(plan, agent, learned, episodes, envelope, seed)
+    evaluation = ModelEnv(dynamics, task, N_EVALUATION_CARS, envelope=slow_gate, seed=seed + 1, **common)
+    return training, evaluation, ModelEnv(dynamics, task, N_EVALUATION_CARS, envelope=envelope, seed=seed + 2, **common)
 
 
 def _trained_policy(

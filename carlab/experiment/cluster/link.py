@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError, first_line
@@ -29,18 +29,6 @@ GOODBYE_S = 2.0
 Emit = Callable[[LinkEvent], None]
 Call = Callable[..., Any]
 """Calls a method of ``TrainingService``, here or on the cluster: its name and arguments."""
-
-
-class Service(Protocol):
-    """A ``TrainingService``, here or on the cluster."""
-
-    def call(self, method: str, *arguments: Any) -> Any:
-        """The result of a method of ``TrainingService``, by its name."""
-        ...
-
-    def end(self) -> None:
-        """End the service."""
-        ...
 
 
 class RayService:
@@ -129,7 +117,7 @@ def run_order(
     emit(LinkEvent("done"))
 
 
-def serve(open_service: Callable[[], Service], requests: Iterable[str], emit: Emit, settings: LinkSettings) -> None:
+def serve(open_service: Callable[[], RayService], requests: Iterable[str], emit: Emit, settings: LinkSettings) -> None:
     """Connect, and run one order after the other; every error is an event.
 
     Args:
@@ -155,7 +143,7 @@ def serve(open_service: Callable[[], Service], requests: Iterable[str], emit: Em
         emit(LinkEvent("unreachable", first_line(error)))
 
 
-def main(service_of: Callable[[str, str, str, LinkSettings], Service] = RayService) -> int:
+def main(service_of: Callable[[str, str, str, LinkSettings], RayService] = RayService) -> int:
     """Serve the requests on standard input; events go to standard output.
 
     Args:
@@ -165,9 +153,9 @@ def main(service_of: Callable[[str, str, str, LinkSettings], Service] = RayServi
     settings = LinkSettings()
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # Whatever Ray prints must not mix with the events.
-    services: list[Service] = []
+    services: list[RayService] = []
 
-    def open_service() -> Service:
+    def open_service() -> RayService:
         services.append(service_of(address, name, device, settings))
         services[0].call("state")
         return services[0]

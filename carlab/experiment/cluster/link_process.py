@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from typing import Protocol
 
 from carlab.core.clock import MonotonicClock
 from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
@@ -17,26 +16,6 @@ from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
 READ_BYTES = 1 << 16
 PROGRAM = (sys.executable, "-m", "carlab.experiment.cluster.link")
 END_TIMEOUT_S = 4.0
-
-
-class Link(Protocol):
-    """A link to the cluster."""
-
-    def send(self, request: LinkRequest | None) -> None:
-        """Open the link unless it is open, and send a request if one is given."""
-        ...
-
-    def poll(self, timeout_s: float) -> LinkEvent | None:
-        """The next event; None if there is none within ``timeout_s``."""
-        ...
-
-    def cut(self) -> None:
-        """Close the link at once; a training on the cluster continues."""
-        ...
-
-    def close(self) -> None:
-        """End the training on the cluster, and close the link."""
-        ...
 
 
 class LinkProcess:
@@ -106,7 +85,11 @@ class LinkProcess:
         self._process, self._text = None, b""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        self._reap(process)
+        process.wait()
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    stream.close()
 
     def close(self) -> None:
         """End the training on the cluster, and close the link."""
@@ -118,11 +101,3 @@ class LinkProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(END_TIMEOUT_S)
         self.cut()
-
-    @staticmethod
-    def _reap(process: subprocess.Popen[bytes]) -> None:
-        process.wait()
-        for stream in (process.stdin, process.stdout):
-            if stream is not None:
-                with contextlib.suppress(BrokenPipeError):
-                    stream.close()

@@ -15,7 +15,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.experiment.campaign.training import Progress, TrainingRequest
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
-from carlab.experiment.cluster.link_process import Link
+from carlab.experiment.cluster.link_process import LinkProcess
 from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
 from carlab.experiment.cluster.order import TrainingOrder
 from carlab.experiment.cluster.settings import LinkSettings
@@ -50,7 +50,7 @@ class ClusterTrainer:
     """
 
     address: str
-    link: Link
+    link: LinkProcess
     say: Callable[[str], None]
     settings: LinkSettings = field(default_factory=LinkSettings)
     train_here: Trainer = train_in_subprocess

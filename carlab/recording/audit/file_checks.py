@@ -12,7 +12,7 @@ from carlab.core.quantities import FloatArray
 from carlab.recording.audit.report import Finding, Severity
 from carlab.recording.column_mapping import (
     COMMAND_CHANNELS,
-    MAPPING_LIMITS,
+    MIN_PERIOD_S,
     POSE_CHANNELS,
     UNITS,
     VELOCITY_CHANNELS,
@@ -145,7 +145,7 @@ def _check_time_unit(t_s: FloatArray, mapping: ColumnMapping) -> Finding | None:
     """
     source = mapping.columns.get("t")
     median_s = float(np.median(np.diff(t_s)))
-    if source is not None and median_s < MAPPING_LIMITS.min_period_s:
+    if source is not None and median_s < MIN_PERIOD_S:
         sentence = (
             f"Column '{source.name}': rows are {median_s:.4g} s apart, closer than the samples of any sensor; correct "
             "the unit with --t-unit, or convert the column to seconds."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -110,17 +110,7 @@ class AuditReport:
             "layout": self.layout,
             "refusal": self.refusal,
             "findings": [
-                {
-                    "id": f.id,
-                    "channel": f.channel,
-                    "severity": f.severity.name.lower(),
-                    "sentence": f.sentence,
-                    "count": f.count,
-                    "rows": list(f.rows),
-                    "evidence": dict(f.evidence),
-                    "option": f.option,
-                }
-                for f in self.findings
+                {**asdict(f), "severity": f.severity.name.lower(), "rows": list(f.rows)} for f in self.findings
             ],
         }
 

@@ -19,7 +19,7 @@ from carlab.recording.audit.file_checks import check_jumps, check_missing, check
 from carlab.recording.audit.report import AuditReport, Finding, Severity, raise_errors
 from carlab.recording.column_mapping import (
     CHANNELS,
-    MAPPING_LIMITS,
+    MAX_LAG_SHARE,
     VELOCITY_CHANNELS,
     ColumnMapping,
     missing_columns,
@@ -47,12 +47,14 @@ class ImportedRecording:
         report: findings of the audit.
         mapping: the mapping that was used.
         announcement: sentence about the recognised or declared layout and the conversions.
+        repaired: findings that prevented the import before ``import_repaired`` repaired them.
     """
 
     episodes: tuple[EpisodeData, ...]
     report: AuditReport
     mapping: ColumnMapping
     announcement: str
+    repaired: tuple[Finding, ...] = ()
 
     @property
     def episode(self) -> EpisodeData:
@@ -315,9 +317,9 @@ def _commands(channels: Channels, mapping: ColumnMapping) -> tuple[FloatArray, F
     if not mapping.command_lag_s:
         return requested, sent, []
     duration_s = float(t_s[-1] - t_s[0])
-    if abs(mapping.command_lag_s) > MAPPING_LIMITS.max_lag_share * duration_s:
+    if abs(mapping.command_lag_s) > MAX_LAG_SHARE * duration_s:
         raise DataError(
-            f"The command lag of {mapping.command_lag_s:g} s exceeds {MAPPING_LIMITS.max_lag_share:.0%} of the "
+            f"The command lag of {mapping.command_lag_s:g} s exceeds {MAX_LAG_SHARE:.0%} of the "
             f"recording ({duration_s:.3g} s); import a longer recording, or change it with --command-lag (0: no shift)."
         )
     requested, sent = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,7 @@ _REPAIRS = {"gaps": "keep", "missing": "drop", "stamps": "drop"}
 _MAX_ITERATIONS = 6
 
 
-@dataclass(frozen=True, slots=True)
-class RepairedImport:
-    """The imported recording, and the repaired findings that prevented its import."""
-
-    imported: ImportedRecording
-    repaired: tuple[Finding, ...]
-
-
-def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -> RepairedImport:
+def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
     """Import a CSV and repair errors for which the audit proposes a safe option.
 
     Repairs: declares the units of pose and velocities, drops rows with a missing value or a stamp that does not
@@ -42,7 +34,7 @@ def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -
     repaired: list[Finding] = []
     for _ in range(_MAX_ITERATIONS):
         try:
-            return RepairedImport(import_csv(path, mapping=mapping), tuple(repaired))
+            return replace(import_csv(path, mapping=mapping), repaired=tuple(repaired))
         except RefusedError as refusal:
             if mapping is None:
                 mapping = recognise_layout(read_csv(path).header, Path(path).name)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -95,53 +95,32 @@ def encode(item: Item, unix: UnixMapping, now_s: float) -> Iterator[Stamped]:
             return
 
 
+def _message(name: str, source: object, **others: Any) -> Any:
+    """A message whose fields are ``others``, or the attributes of ``source`` that have the names of its fields."""
+    own = {field.name: getattr(source, field.name) for field in schemas.MESSAGES[name] if field.name not in others}
+    return schemas.CLASSES[name](**own, **others)
+
+
 def _tick(item: Tick, unix: UnixMapping) -> Iterator[Stamped]:
     yield from _observation(item.observation, item.step, item.t_s, unix)
-    capture_s = item.observation.t_capture_s
     for topic, action in ((schemas.REQUESTED_TOPIC, item.requested), (schemas.SENT_TOPIC, item.sent)):
-        message = schemas.CLASSES["Action"](
-            t_s=item.t_s, step=item.step, steering=action.steering, throttle=action.throttle
-        )
+        message = _message("Action", action, t_s=item.t_s, step=item.step)
         yield Stamped(topic, message, item.t_s, item.t_s, item.step)
-    tick = schemas.CLASSES["Tick"](
-        t_s=item.t_s,
-        step=item.step,
-        late_s=item.late_s,
-        policy_s=item.policy_s,
-        safety_state=text(item.safety_state),
-        features=np.asarray(item.features).tolist(),
-    )
-    yield Stamped(schemas.TICK_TOPIC, tick, item.t_s, capture_s, item.step)
+    features = np.asarray(item.features).tolist()
+    tick = _message("Tick", item, safety_state=text(item.safety_state), features=features)
+    yield Stamped(schemas.TICK_TOPIC, tick, item.t_s, item.observation.t_capture_s, item.step)
 
 
 def _transition(item: Transition) -> Stamped:
-    transition = schemas.CLASSES["Transition"](
-        t_s=item.t_s,
-        step=item.step,
-        features=np.asarray(item.features).tolist(),
-        steering=item.action.steering,
-        throttle=item.action.throttle,
-        reward=item.reward,
-        next_features=np.asarray(item.next_features).tolist(),
-        terminated=item.terminated,
-        truncated=item.truncated,
-    )
+    features, next_features = (np.asarray(each).tolist() for each in (item.features, item.next_features))
+    action = {"steering": item.action.steering, "throttle": item.action.throttle}
+    transition = _message("Transition", item, features=features, next_features=next_features, **action)
     return Stamped(schemas.TRANSITION_TOPIC, transition, item.t_s, item.t_s, item.step)
 
 
 def _observation(seen: Observation, step: int, t_s: float, unix: UnixMapping) -> Iterator[Stamped]:
     for pose in seen.poses:
-        sample = schemas.CLASSES["PoseSample"](
-            t_capture_s=pose.t_capture_s,
-            t_receive_s=pose.t_receive_s,
-            sequence=pose.sequence,
-            x_m=pose.x_m,
-            y_m=pose.y_m,
-            z_m=pose.z_m,
-            yaw_rad=pose.yaw_rad,
-            tracked=pose.tracked,
-        )
-        yield Stamped(schemas.SAMPLE_TOPIC, sample, t_s, pose.t_capture_s, step)
+        yield Stamped(schemas.SAMPLE_TOPIC, _message("PoseSample", pose), t_s, pose.t_capture_s, step)
         if pose.tracked:
             in_frame = PoseInFrame(frame_id="map")
             in_frame.timestamp.FromNanoseconds(unix.to_ns(pose.t_capture_s))
@@ -150,22 +129,7 @@ def _observation(seen: Observation, step: int, t_s: float, unix: UnixMapping) ->
             _turn(in_frame.pose.orientation, pose.yaw_rad)
             yield Stamped(schemas.POSE_TOPIC, in_frame, t_s, pose.t_capture_s, step)
     state = seen.state
-    message = schemas.CLASSES["CarState"](
-        t_s=t_s,
-        step=step,
-        x_m=state.x_m,
-        y_m=state.y_m,
-        yaw_rad=state.yaw_rad,
-        vx_mps=state.vx_mps,
-        vy_mps=state.vy_mps,
-        yaw_rate_radps=state.yaw_rate_radps,
-        age_s=t_s - seen.t_capture_s,
-        t_capture_s=seen.t_capture_s,
-        t_receive_s=seen.t_receive_s,
-        sequence=seen.sequence,
-        tracked=seen.tracked,
-        velocity_delay_s=seen.velocity_delay_s,
-    )
+    message = _message("CarState", seen, t_s=t_s, step=step, age_s=t_s - seen.t_capture_s, **asdict(state))
     yield Stamped(schemas.STATE_TOPIC, message, t_s, seen.t_capture_s, step)
     transform = FrameTransform(parent_frame_id="map", child_frame_id="base_link")
     transform.timestamp.FromNanoseconds(unix.to_ns(seen.t_capture_s))
@@ -306,18 +270,6 @@ def decode_health(m: Any) -> HealthReading:
     return HealthReading(m.t_s, Health(m.ready, tuple(m.problems), readings, tuple(m.warnings)))
 
 
-def decode_event(m: Any) -> SafetyEvent:
-    """Decode a SafetyEvent message."""
-    return SafetyEvent(m.t_s, m.kind, m.text)
-
-
 def decode_log(m: Any) -> LogLine:
     """Decode a Log message; the level is that of the standard library's logging."""
     return LogLine(m.timestamp.ToNanoseconds(), _NUMBERS.get(m.level, logging.NOTSET), m.name, m.message)
-
-
-DECODERS: dict[str, Callable[[Any], Transition | HealthReading | SafetyEvent]] = {
-    schemas.TRANSITION_TOPIC: decode_transition,
-    schemas.HEALTH_TOPIC: decode_health,
-    schemas.EVENT_TOPIC: decode_event,
-}

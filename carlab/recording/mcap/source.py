@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Attachment, Channel, Header, Message, Metadata
 
-from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, SafetyEvent, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import Action, Observation, PoseSample
@@ -37,11 +37,6 @@ class Recording:
     log: tuple[LogLine, ...]
     defect: FileDefect | None
     extra: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
-
-    @property
-    def recovered(self) -> bool:
-        """Whether the file is incomplete."""
-        return self.defect is not None
 
 
 def read_episode(path: Path | str) -> EpisodeData:
@@ -141,6 +136,9 @@ class _Collector:
             schemas.TICK_TOPIC: self._handle_tick,
             schemas.LOG_TOPIC: lambda m: self._log.append(messages.decode_log(m)),
             schemas.EXTRA_TOPIC: lambda m: self._extra.__setitem__(m.step, dict(zip(m.names, m.values, strict=False))),
+            schemas.TRANSITION_TOPIC: lambda m: self._documents.append(messages.decode_transition(m)),
+            schemas.HEALTH_TOPIC: lambda m: self._documents.append(messages.decode_health(m)),
+            schemas.EVENT_TOPIC: lambda m: self._documents.append(SafetyEvent(m.t_s, m.kind, m.text)),
         }
 
     def take(self, record: object) -> None:
@@ -165,14 +163,10 @@ class _Collector:
         self._actions.clear()
 
     def _handle_message(self, topic: str, data: bytes) -> None:
-        if topic not in self._handlers and topic not in messages.DECODERS:
-            return
-        message = schemas.TOPIC_CLASSES[topic]()
-        message.ParseFromString(data)
         if topic in self._handlers:
+            message = schemas.TOPIC_CLASSES[topic]()
+            message.ParseFromString(data)
             self._handlers[topic](message)
-        else:
-            self._documents.append(messages.DECODERS[topic](message))
 
     def _handle_state(self, m: Any) -> None:
         self._state = (m.step, messages.decode_observation(m, tuple(self._poses)))

@@ -8,17 +8,16 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from pathlib import Path
 
-from carlab.core.clock import monotonic_ns
+from carlab.core.clock import MonotonicClock
 from carlab.core.errors import DataError, NotReadyError
 from carlab.recording.rerun.viewer import ADDRESS, free_port, rerun_program, wait_until_open
 from carlab.recording.sink import writing
 
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 _CANNOT = "The rerun viewer cannot draw here"
-_SETTLE_NS = 5 * 10**9
+_SETTLE_S = 5.0
 _NO_DRIVER = (
     "no Vulkan driver is installed; install one that needs no graphics card with "
     "'apt-get install mesa-vulkan-drivers libvulkan1'"
@@ -69,7 +68,7 @@ def save_screenshot(
             command, stdout=subprocess.DEVNULL, stderr=log, env=surroundings, start_new_session=True
         )
         try:
-            picture = _settled_picture(viewer, port, Path(folder), monotonic_ns() + int(timeout_s * 1e9))
+            picture = _settled_picture(viewer, port, Path(folder), MonotonicClock().now_s() + timeout_s)
         except (RuntimeError, OSError, ConnectionError) as error:
             log.seek(0)
             lines = [line.strip() for line in log if line.strip()]
@@ -91,19 +90,19 @@ def _end(viewer: subprocess.Popen[bytes]) -> None:
     viewer.wait()
 
 
-def _settled_picture(viewer: subprocess.Popen[bytes], port: int, folder: Path, give_up_ns: int) -> bytes:
+def _settled_picture(viewer: subprocess.Popen[bytes], port: int, folder: Path, give_up_s: float) -> bytes:
     """Bytes of the first picture that equals the previous one, when axis ranges are final and messages have gone."""
     from rerun.experimental import ViewerClient
 
-    wait_until_open(viewer, port, give_up_ns)
-    pause = threading.Event()
+    wait_until_open(viewer, port, give_up_s)
+    clock = MonotonicClock()
     client = ViewerClient(ADDRESS.format(port=port))
     path = folder / "picture.png"
-    began_ns, before = monotonic_ns(), b""
+    began_s, before = clock.now_s(), b""
     while True:
-        pause.wait(1.5)
+        clock.sleep_until(clock.now_s() + 1.5)
         client.save_screenshot(str(path))
         picture = path.read_bytes()
-        if (picture == before and monotonic_ns() - began_ns > _SETTLE_NS) or monotonic_ns() > give_up_ns:
+        if (picture == before and clock.now_s() - began_s > _SETTLE_S) or clock.now_s() > give_up_s:
             return picture
         before = picture

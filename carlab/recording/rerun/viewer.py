@@ -7,19 +7,18 @@ import shutil
 import socket
 import subprocess
 import sys
-import threading
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import rerun as rr
 
-from carlab.core.clock import monotonic_ns
+from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError, DataError, NotReadyError
 
 ADDRESS = "rerun+http://127.0.0.1:{port}/proxy"
 DEFAULT_PORT = 9876
 _CONNECT_TIMEOUT_S = 3.0
-_START_TIMEOUT_NS = 30 * 10**9
+_START_TIMEOUT_S = 30.0
 _FIRST_BYTES = b"RRF"
 """First bytes of a rerun recording of any version."""
 
@@ -47,17 +46,17 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def wait_until_open(viewer: subprocess.Popen[bytes], port: int, give_up_ns: int) -> None:
+def wait_until_open(viewer: subprocess.Popen[bytes], port: int, give_up_s: float) -> None:
     """Wait until a viewer listens on its port. Raises RuntimeError if it ends, or at a time of the monotonic clock."""
-    pause = threading.Event()
+    clock = MonotonicClock()
     while True:
         if viewer.poll() is not None:
             raise RuntimeError(f"the viewer ended with code {viewer.returncode}")
-        if monotonic_ns() > give_up_ns:
+        if clock.now_s() > give_up_s:
             raise RuntimeError("the viewer did not start in time")
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
             return
-        pause.wait(0.1)
+        clock.sleep_until(clock.now_s() + 0.1)
 
 
 def open_viewer(stream: rr.RecordingStream, program: Path) -> None:
@@ -72,10 +71,10 @@ def open_viewer(stream: rr.RecordingStream, program: Path) -> None:
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
     )  # fmt: skip
     try:
-        wait_until_open(viewer, port, monotonic_ns() + _START_TIMEOUT_NS)
+        wait_until_open(viewer, port, MonotonicClock().now_s() + _START_TIMEOUT_S)
     except RuntimeError as error:
         raise NotReadyError("The viewer", [f"{error}; run 'rerun' in a terminal to see why."]) from error
-    connect_to_viewer(stream, ADDRESS.format(port=port))
+    stream.connect_grpc(ADDRESS.format(port=port))
 
 
 def check_viewer(address: str) -> None:
@@ -98,8 +97,3 @@ def check_viewer(address: str) -> None:
     except OSError as error:
         reason = f"no viewer listens at {host}:{port} ({error}); open it there with 'rerun', or remove --viewer."
         raise NotReadyError("The viewer", [reason]) from error
-
-
-def connect_to_viewer(stream: rr.RecordingStream, address: str) -> None:
-    """Connect a stream to an open viewer."""
-    stream.connect_grpc(address)

@@ -1,11 +1,11 @@
 """Documents of an episode as a control loop emits them, with values that are hard to store exactly."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
-import pytest
 
-from carlab.core.documents import EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, CarState, Health, Observation, PoseSample, Reality
 
@@ -30,7 +30,7 @@ def _observation(k: int) -> Observation:
     return Observation(_state(k), t_s - 0.006, t_s - 0.001, 10 * k + 2, k != 3, 0.025, poses)
 
 
-def _documents(ticks: int, *, end: bool = True):
+def documents(ticks: int, *, end: bool = True) -> Iterator[Document]:
     yield EpisodeStarted(
         episode=7,
         t_s=START_S - 0.5,
@@ -77,7 +77,5 @@ def _documents(ticks: int, *, end: bool = True):
         )
 
 
-@pytest.fixture
-def make_documents():
-    """``make_documents(ticks, end=True)`` -> list of documents."""
-    return lambda ticks=60, *, end=True: list(_documents(ticks, end=end))
+def make_documents(ticks: int = 60, *, end: bool = True) -> list[Document]:
+    return list(documents(ticks, end=end))
