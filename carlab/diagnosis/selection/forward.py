@@ -57,21 +57,7 @@ class Path:
 def extend(
     problem: SearchProblem, path: Path, control: RunControl, visited: AbstractSet[frozenset[str]] = frozenset()
 ) -> Path:
-    """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets.
-
-    Then its fit is restarted. From a lower minimum, the path continues.
-    """
-    while True:
-        path = _with_accepted(problem, path, control, visited)
-        model = path.model if _effects(path) in visited else restart(problem, path.model, control)
-        if model is path.model:
-            return path
-        path = replace(path, model=apply_moves(problem, model, control))
-
-
-def _with_accepted(
-    problem: SearchProblem, path: Path, control: RunControl, visited: AbstractSet[frozenset[str]]
-) -> Path:
+    """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets."""
     max_effects = problem.settings.selection.max_effects
     while len(path.model.effects) < max_effects and _effects(path) not in visited and not control.ends_search():
         count = len(path.model.effects)
@@ -142,7 +128,7 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     leader, before = chosen[0], path.model
     log.info("accepted %s", leader.effect)
     added = fit_with_scale(problem, (*before.effects, leader.effect), leader.fit.config, leader.fit.free, leader.fit.z)
-    model = apply_moves(problem, added, control)
+    model = apply_moves(problem, restart(problem, added, control), control)
     confusable = problem.confusable.get(leader.effect, ())
     others = tuple(Choice(path, c) for c in chosen[1:] if c.effect not in confusable)
     return Path(

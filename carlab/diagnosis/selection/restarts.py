@@ -23,10 +23,11 @@ log = logging.getLogger(__name__)
 def restart(problem: SearchProblem, model: Model, control: RunControl) -> Model:
     """The model, or one with the same effects and a lower cost, from perturbed parameters.
 
-    A model that reaches the noise is not restarted: the minimum is right.
+    A model that reaches the noise, or with few effects, is not restarted.
     """
     excess = float(np.mean((model.scale.sigma / problem.floor) ** 2)) - 1.0
-    if excess < RESTARTS.min_model_error or control.ends_search():
+    is_accurate = excess < RESTARTS.min_model_error
+    if is_accurate or len(model.effects) < RESTARTS.min_effects or control.ends_search():
         return model
     config, free = problem.config_with(model.effects), model.fit.free
     fit = partial(problem.fitter(model.scale).fit, iterations=RESTARTS.iterations)

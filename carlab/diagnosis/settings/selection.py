@@ -81,7 +81,7 @@ class SelectionSettings:
     """A confusable effect may replace an effect if its screening score is at least this share of the effect's gain."""
     search_time_share: float = 0.6
     """Share of ``--budget`` for the search; the rest is for eliminations, pairwise tests and the report."""
-    max_effects: int = 10
+    max_effects: int = 12
     """Maximum number of effects."""
     min_remaining_excess: float = 0.1
     """Other choices are followed if the effects of the greedy path leave this share of the refit's squared excess."""
@@ -142,7 +142,7 @@ class SelectionSettings:
 class RestartSettings:
     """Restarts of a fit from perturbed parameters."""
 
-    count: int = 3
+    count: int = 5
     """Number of perturbed starts. On train_1 of the ETH car, five of six end at a lower cost than the fit without."""
     width: float = 0.3
     """Standard deviation of the perturbation, over that of the prior (effects: over their typical sizes)."""
@@ -150,6 +150,8 @@ class RestartSettings:
     """Seed of the perturbations."""
     iterations: int = 8
     """Number of iterations after which the costs are compared; 20 give the same minimum."""
+    min_effects: int = 4
+    """Number of effects from which a model is restarted; on train_1 fits with fewer ended at one minimum."""
     min_fall_share: float = 0.01
     """Minimum relative fall of the cost; smaller ones are differences between fits that end near one minimum."""
     min_model_error: float = 1.0
