@@ -93,9 +93,10 @@ def brush_shape(b: float, c: float) -> Callable[[float], float]:
     return shape
 
 
-def one_way(now: Instant, share: float) -> float:
-    """A one-way bearing: the front wheels drive, but do not brake (the end is soft, over 0.2 N)."""
-    return share * 0.5 * (now.fx + math.hypot(now.fx, 0.2))
+def slipping_clutch(fx: float, share: float, car: BaseCar) -> float:
+    """A clutch before the front axle that slips gradually; its torque is limited to half of full throttle's."""
+    top = 0.5 * share * car.drive_gain
+    return top * math.tanh(share * fx / top) if top > 0.0 else 0.0
 
 
 @hook("tyre")
@@ -235,7 +236,7 @@ FORMS = (
     Form("aerodynamic_drag", "other", drag_parameters, powered_drag, 0.05, 1.5),
     Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
     Form("tyre_saturation", "other", saturating, other_tyres(brush_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
-    Form("all_wheel_drive", "other", plain("share"), driven_front(one_way), 0.1, 1.0),
+    Form("all_wheel_drive", "other", plain("share"), driven_front(slipping_clutch), 0.1, 1.0),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
     Form("longitudinal_slip", "other", slipping, driven_wheels(brush_shape(1.0, 1.0)), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),

@@ -40,8 +40,8 @@ def other_tyres(shape: Callable[[float, float], Callable[[float], float]]) -> At
     return attach
 
 
-def driven_front(front_force: Callable[[Instant, float], float]) -> Attach:
-    """A part of F_x acts at the front wheels, along them; ``front_force`` gives it from the instant and the share."""
+def driven_front(front_force: Callable[[float, float, BaseCar], float]) -> Attach:
+    """A part of F_x acts at the front wheels, along them; ``front_force`` gives it from F_x, the share and the car."""
 
     def attach(world: World, p: Parameters) -> None:
         arm = world.car.front_axle
@@ -52,7 +52,7 @@ def driven_front(front_force: Callable[[Instant, float], float]) -> Attach:
             now.moment += arm * now.fx_f * now.sin_d
 
         def split(now: Instant) -> None:
-            now.fx_f = front_force(now, p["share"])
+            now.fx_f = front_force(now.fx, p["share"], world.car)
 
         world.hooks["tyre"].insert(0, split)
         world.hooks["body"].append(pull)
@@ -179,7 +179,7 @@ def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 FORMS = (
     Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
-    Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda now, share: share * now.fx), 0.1, 1.0),
+    Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda fx, share, car: share * fx), 0.1, 1.0),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
     Form("longitudinal_slip", "catalogue", slipping, driven_wheels(math.tanh), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),
