@@ -223,13 +223,13 @@ class Forces:
     Units: t_s [s] since the first row of the recording, positions [m], velocities [m/s, rad/s] in the body frame,
     forces [N] in the body frame (side forces in the wheel frame, positive left), moment [N m] about the centre of mass,
     wheel_angle [rad], throttle [1], mass [kg], loads of the axles [N], friction coefficients ``grip_front`` and
-    ``grip_rear`` [1]. ``front_axle`` and ``rear_axle`` are distances from the centre of mass [m]. ``full_drive`` is the car file's motor force at full throttle, ``drive`` the motor's force, ``axle_force`` the
-    F_x of the driven axle (drive less damping), ``demand`` the same before wheel slip, ``front_force`` the part
-    of ``axle_force`` at the front wheels, along them (None: rear-wheel drive), ``force_x`` all longitudinal
-    forces but the tyres' side forces. ``front_per_load`` is the steady side force of the front axle for each
-    newton of its load. ``states`` are the extra states of effects by name; an effect puts their time derivatives
-    into ``rates``. ``stiff`` has, within a Runge-Kutta step, the ``StiffStep`` of each effect with stiff states,
-    by effect id.
+    ``grip_rear`` [1]. ``front_axle`` and ``rear_axle`` are distances from the centre of mass [m]. ``full_drive`` is the
+    car file's motor force at full throttle, ``drive`` the motor's force, ``axle_force`` the F_x of the driven axle
+    (drive less damping), ``demand`` the same before wheel slip, ``front_force`` the part of ``axle_force`` at the front
+    wheels, along them (None: rear-wheel drive), ``force_x`` all longitudinal forces but the tyres' side forces.
+    ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are the extra
+    states of effects by name; an effect puts their time derivatives into ``rates``. ``stiff`` has, within a Runge-Kutta
+    step, the ``StiffStep`` of each effect with stiff states, by effect id.
     """
 
     t_s: Value

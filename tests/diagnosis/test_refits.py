@@ -220,4 +220,5 @@ def test_progress_of_a_step_does_not_go_back() -> None:
     candidates.next_candidates(problem, model, RunControl(lambda activity, share: shares.append(share)))
     assert len(shares) > 4
     assert shares == sorted(shares)
-    assert 0.1 <= shares[0] < shares[-1] < 0.2
+    step = 1.0 / problem.settings.selection.max_effects
+    assert step <= shares[0] < shares[-1] < 2.0 * step
