@@ -156,7 +156,7 @@ def replay(
 
     above_zero(seconds=seconds)
     valid_seed(seed=seed)
-    # Only ``drive`` checks and warns.
+    # ``drive``, which is called below, checks the car and warns.
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed, is_driven=False)
     if isinstance(recording, EpisodeData):
         episode = recording
