@@ -265,6 +265,8 @@ def test_log_lines_and_early_events_are_recorded(tmp_path):
     assert recording.documents[1] == SafetyEvent(1.0, "armed", "before the start")
 
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+"""The environment of a process that finds the modules of the tests in any folder."""
 WRITER = """
 import sys, time
 from carlab.recording.mcap.sink import McapSink
@@ -285,7 +287,7 @@ for document in documents(100000, end=False):
 def test_sigkill_loses_at_most_half_a_second(tmp_path):
     path = tmp_path / "0001.mcap"
     command = [sys.executable, "-c", WRITER, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT) as child:
         emitted = []
         for line in child.stdout:
             step, t_s = line.split()
@@ -325,7 +327,7 @@ print(recorder.failed)
 @pytest.mark.parametrize("max_bytes", [40_000, 150_000])
 def test_file_size_limit_gives_one_sentence_and_readable_partial_files(tmp_path, max_bytes):
     command = [sys.executable, "-c", WRITER_WITH_SIZE_LIMIT, str(tmp_path), str(max_bytes)]
-    writer = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    writer = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120, env=ENVIRONMENT)
     assert " could not be written: File too large" in writer.stdout
     assert "Traceback" not in writer.stdout + writer.stderr
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1.mcap.partial", "1.rrd.partial", "2.mcap.partial"]
