@@ -147,7 +147,7 @@ def decorrelation_of(correlation: Tensor, error_std: Tensor) -> Tensor:
     return error_std[:, None] * decorrelation / error_std
 
 
-def most_likely_dof(log_likelihood: Callable[[float], float]) -> float:
+def maximum_likelihood_dof(log_likelihood: Callable[[float], float]) -> float:
     """Degrees of freedom among ``DOF_CANDIDATES`` by their log-likelihood; more have to gain ``DOF_MIN_GAIN_NATS``."""
     best, dof = -math.inf, math.inf
     for candidate in DOF_CANDIDATES:
@@ -166,7 +166,7 @@ def student_weights(square: Tensor, outputs: int) -> tuple[float, Tensor]:
     Returns:
         Degrees of freedom, and the weight of each row (n,), at most 1.
     """
-    dof = most_likely_dof(lambda candidate: float(log_student(square, outputs, candidate).sum()))
+    dof = maximum_likelihood_dof(lambda candidate: float(log_student(square, outputs, candidate).sum()))
     if math.isinf(dof):
         return dof, torch.ones_like(square)
     return dof, ((dof + outputs) / (dof + square)).clamp_max(1.0)

@@ -347,7 +347,7 @@ class SafeCar:
     def _pose_problems(self, now_s: float) -> str:
         """Reasons why the poses may be wrong, as one text. If they last for ``lost_pose_s``, the episode ends.
 
-        Arming checks them too, but a wrong axis is visible only after the car has turned or moved sideways.
+        Arming checks them too, but a car that drives straight ahead does not show a wrong axis.
         """
         problems = self.car.pose_problems()
         if not problems:

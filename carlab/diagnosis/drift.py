@@ -198,8 +198,8 @@ def _changes(
         spread = float(np.sqrt(np.mean(std[~first, k] ** 2) + np.var(along_fitted[:, k])))
         ends = float(mean[first, k].mean()) - before, float(mean[last, k].mean()) - before
         found.append(QuantityChange(*QUANTITIES[k], value, spread, *ends))
-    kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= DRIFT.change_z_min * c.std]
-    return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
+    significant = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= DRIFT.change_z_min * c.std]
+    return tuple(sorted(significant, key=lambda c: -abs(c.value) / c.std))
 
 
 def changes_along(series: DisturbanceSeries) -> tuple[QuantityChange, ...]:

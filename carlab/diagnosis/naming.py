@@ -150,10 +150,10 @@ def _are_spurious(
     is_additional = rival is not None and rival.names == found.effects
     unnamed_gain = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
     count = len(found.effects)
-    if not control.effects_stand(found.effects, _limits_in_addition(problem, found, unnamed_gain, held_out), count):
+    if not control.are_confirmed(found.effects, _limits_in_addition(problem, found, unnamed_gain, held_out), count):
         return True
     is_small_set = count < problem.settings.rivals.many_effects
-    return is_small_set and not control.effects_stand(found.effects, _limits_in_place(problem, found), count)
+    return is_small_set and not control.are_confirmed(found.effects, _limits_in_place(problem, found), count)
 
 
 def _limits_in_addition(
@@ -215,7 +215,7 @@ def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldO
     alternatives = tuple(
         (Condition("rivals.min_explained_share", share, settings.min_explained_share),) for share in shares
     )
-    little = not control.effects_stand(found.effects, alternatives, len(found.effects))
+    little = not control.are_confirmed(found.effects, alternatives, len(found.effects))
     if little:
         log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), max(shares))
     return little

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.evaluation import Mixture
-from learning.outliers import DOF_CANDIDATES, log_student, mahalanobis_sq, most_likely_dof, output_correlation
+from learning.outliers import DOF_CANDIDATES, log_student, mahalanobis_sq, maximum_likelihood_dof, output_correlation
 
 SCALE_ITERATIONS = 60
 """Iterations of the expectation maximisation of the common scale."""
@@ -101,7 +101,7 @@ def fit_residuals(
         s = scale_for(dof)
         return float(log_student(square / s**2, outputs, dof).sum()) - count * outputs * math.log(s)
 
-    dof = most_likely_dof(log_likelihood)
+    dof = maximum_likelihood_dof(log_likelihood)
     max_dof = max(free_rows + weight, MIN_DOF)
     # Residuals of fitted rows are smaller than errors at new rows.
     variance_factor = (count + weight) / max(free_rows + weight, 1.0)

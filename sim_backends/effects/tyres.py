@@ -177,20 +177,21 @@ class FrictionEllipse(DynamicsEffect):
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale or limit the side force of the driven axles."""
-
-        def remaining(side: Value, grip: Value, force_x: Value) -> Value:
-            share = ops.clip(values["scale"] * force_x / grip, -MAX_SHARE, MAX_SHARE)
-            factor = ops.sqrt(1.0 - share * share)
-            limit = factor * ops.at_least(ops.abs(side), grip)
-            return ops.where(values["action"] < 0.5, factor * side, ops.clip(side, -limit, limit))
-
         rear_force = forces.axle_force
         if forces.front_force is not None:
             rear_force = rear_force - forces.front_force
-            grip_front = ops.at_least(forces.grip_front * forces.load_front, 1e-6)
-            forces.side_front = remaining(forces.side_front, grip_front, forces.front_force)
-        grip_rear = ops.at_least(forces.grip_rear * forces.load_rear, 1e-6)
-        forces.side_rear = remaining(forces.side_rear, grip_rear, rear_force)
+            peak = forces.grip_front * forces.load_front
+            forces.side_front = self._side_force(ops, forces.side_front, peak, forces.front_force, values)
+        peak = forces.grip_rear * forces.load_rear
+        forces.side_rear = self._side_force(ops, forces.side_rear, peak, rear_force, values)
+
+    def _side_force(self, ops: Ops, side: Value, peak: Value, force_x: Value, values: Parameters) -> Value:
+        """Side force of an axle with the side force ``side``, the grip ``peak`` and the drive force ``force_x`` [N]."""
+        peak = ops.at_least(peak, 1e-6)
+        share = ops.clip(values["scale"] * force_x / peak, -MAX_SHARE, MAX_SHARE)
+        factor = ops.sqrt(1.0 - share * share)
+        limit = factor * ops.at_least(ops.abs(side), peak)
+        return ops.where(values["action"] < 0.5, factor * side, ops.clip(side, -limit, limit))
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
         """Both actions at several scales."""

@@ -146,12 +146,14 @@ def test_fit_with_parameters_at_their_bounds_reaches_the_minimum_of_scipy():
         changes = [residuals(a) - residuals(b) for a, b in zip(*ends, strict=True)]
         return np.stack(changes, axis=1) / np.diag(ends[0] - ends[1])
 
-    exact = least_squares(residuals, 0.0 * low, jacobian, (low, high), loss="huber", f_scale=IDENTIFICATION.huber_delta)
+    by_scipy = least_squares(
+        residuals, 0.0 * low, jacobian, (low, high), loss="huber", f_scale=IDENTIFICATION.huber_delta
+    )
     at_bound = {"motor.drive_gain", "tyre.rear.C"}
     for start in (np.zeros(len(free)), np.full(len(free), 3.0), np.full(len(free), -3.0)):
         fit = fitter.fit(car, free, start)
         assert fit.cost == pytest.approx(loss(fit.z), rel=1e-4)
-        assert fit.cost < loss(exact.x) * 1.003
+        assert fit.cost < loss(by_scipy.x) * 1.003
         reached = {f.name for f, z, a, b in zip(free, fit.z, low, high, strict=True) if z in (a, b)}
         assert at_bound <= reached
         covariance = fitter.with_covariance(fit).covariance

@@ -25,7 +25,7 @@ from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.effects import CATALOGUE
-from tests.helpers.case_files import car_in, imported, turned, write_case
+from tests.helpers.case_files import car_in, imported, rotated, write_case
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
@@ -77,8 +77,8 @@ def found(
 ) -> Outcome:
     """Diagnose a case, measured with misalignments [rad] of the fitted and the held-out recording."""
     write_case(case, folder)
-    fit = imported(turned(case.fit, angles[0]), folder / "fit.csv")
-    hold = imported(turned(case.hold, angles[1]), folder / "hold.csv")
+    fit = imported(rotated(case.fit, angles[0]), folder / "fit.csv")
+    hold = imported(rotated(case.hold, angles[1]), folder / "hold.csv")
     return diagnose(fit, hold, car_in(folder), settings=settings, **options)
 
 

@@ -21,7 +21,7 @@ from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
-from tests.helpers.case_files import car_in, imported, turned
+from tests.helpers.case_files import car_in, imported, rotated
 
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=1.2, held_out_stride_s=1.0))
 """A quarter of the windows of the default."""
@@ -55,7 +55,7 @@ def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def diagnosed(case: Case, folder: Path, nominal: SimulatorConfig, angle_rad: float, stated_rad: float) -> Outcome:
     """Diagnose drives with a yaw misalignment, of which the car file states another value."""
-    read = (imported(turned(table, angle_rad), folder / "drive.csv") for table in (case.fit, case.hold))
+    read = (imported(rotated(table, angle_rad), folder / "drive.csv") for table in (case.fit, case.hold))
     stated = replace(nominal, effects={MISALIGNMENT: {"angle": stated_rad}})
     return diagnose(*read, stated, settings=FEWER)
 
@@ -208,8 +208,8 @@ def test_requested_effect_that_increases_the_held_out_error_is_withdrawn(
     The base parameters are known, so that a refit does not imitate the misalignment.
     """
     known = replace(nominal, parameter_std={f.name: 0.01 * f.origin for f in base_parameters(nominal) if f.logarithmic})
-    fit = imported(turned(case.fit, 0.06), tmp_path / "fit.csv")
-    hold = imported(turned(case.hold, -0.06 if is_opposite else 0.06), tmp_path / "hold.csv")
+    fit = imported(rotated(case.fit, 0.06), tmp_path / "fit.csv")
+    hold = imported(rotated(case.hold, -0.06 if is_opposite else 0.06), tmp_path / "hold.csv")
     outcome = diagnose(fit, hold, known, settings=FEWER, effects=(MISALIGNMENT,))
     assert [effect.id for effect in outcome.diagnosis.effects] == ([] if is_opposite else [MISALIGNMENT])
 

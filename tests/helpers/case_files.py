@@ -37,8 +37,8 @@ def imported(table: Table, path: Path) -> list[EpisodeData]:
     return episodes_in(path)
 
 
-def turned(table: Table, angle: float) -> Table:
-    """The same drive measured by a camera system that sees the car turned by ``angle`` [rad]."""
+def rotated(table: Table, angle: float) -> Table:
+    """The same drive measured by a camera system whose yaw has the offset ``angle`` [rad]."""
     sin, cos = np.sin(angle), np.cos(angle)
     vx, vy = table["vx"], table["vy"]
     return table | {"yaw": table["yaw"] + angle, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}

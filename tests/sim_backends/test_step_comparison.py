@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from sim_backends.array_ops import FloatOps
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.advance import (
     Key,
@@ -38,19 +39,13 @@ Step = Callable[[Rows], tuple[torch.Tensor, ...]]
 class CasadiOps:
     """Elementary functions on CasADi symbols."""
 
+    fma, fms = staticmethod(FloatOps.fma), staticmethod(FloatOps.fms)
+
     def __init__(self, casadi: Any) -> None:
         for name in ("sin", "cos", "atan", "atan2", "tanh", "exp", "sqrt", "hypot", "fabs", "sign"):
             setattr(self, name, getattr(casadi, name))
         self.slope_angle, self.abs, self.at_least = casadi.atan2, casadi.fabs, casadi.fmax
         self.pow, self.where = casadi.power, casadi.if_else
-
-    @staticmethod
-    def fma(a: Any, b: Any, c: Any) -> Any:
-        return a * b + c
-
-    @staticmethod
-    def fms(a: Any, b: Any, c: Any) -> Any:
-        return c - a * b
 
 
 def rows_of(cars: int, dtype: torch.dtype) -> Rows:

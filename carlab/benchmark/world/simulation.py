@@ -18,6 +18,9 @@ from carlab.core.errors import DataError
 FloatArray = NDArray[np.float64]
 Driver = Callable[[float, FloatArray], tuple[float, float]]
 RTOL = 1e-8
+SAME_TIME_S = 1e-12
+TOP_SPEED_MPS = 50.0
+"""A faster car has an unstable effect."""
 HIDDEN_STEP_S = 1e-3
 """Step for hidden states along given states; a wheel with longitudinal slip has the shortest time constant, 1.4 ms."""
 
@@ -67,7 +70,7 @@ class _Acting:
     def switch(self, t: float) -> None:
         due = False
         for channel, queue in enumerate(self.queues):
-            while queue and queue[0][0] <= t + 1e-12:
+            while queue and queue[0][0] <= t + SAME_TIME_S:
                 value = queue.popleft()[1]
                 due = True
                 if channel == 0:
@@ -126,20 +129,20 @@ def drive(
         next_capture = capture_s[captured] if captured < len(capture_s) else np.inf
         next_tick = tick * period if tick < count else np.inf
         due = min(next_capture, next_tick, acting.next_s())
-        if due > t + 1e-12:
+        if due > t + SAME_TIME_S:
             solver.set_initial_value(state, t)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # checked below and raised as an error
                 state = solver.integrate(due)
-            if not solver.successful() or not np.isfinite(state).all() or abs(state[3]) > 50.0:
+            if not solver.successful() or not np.isfinite(state).all() or abs(state[3]) > TOP_SPEED_MPS:
                 raise DataError(f"The concealed car cannot be integrated beyond {t:.3f} s; use another size or seed.")
             t = due
-        if acting.next_s() <= t + 1e-12:
+        if acting.next_s() <= t + SAME_TIME_S:
             acting.switch(t)
-        if next_capture <= max(t, due) + 1e-12:
+        if next_capture <= max(t, due) + SAME_TIME_S:
             captures[captured] = state[:6] if next_capture >= 0.0 else _before(state, next_capture)
             captured += 1
-        if next_tick <= t + 1e-12:
+        if next_tick <= t + SAME_TIME_S:
             commands[tick] = driver(next_tick, captures[max(captured - 1, 0)] if captured else state[:6])
             acting.issue(next_tick, (float(commands[tick, 0]), float(commands[tick, 1])))
             tick += 1
@@ -147,6 +150,7 @@ def drive(
 
 
 def _before(state: FloatArray, t: float) -> FloatArray:
+    """The state (6,) at ``t`` < 0 of a car that has moved with the velocities of its start."""
     early = state[:6].copy()
     cos, sin = np.cos(early[2]), np.sin(early[2])
     early[0] += t * (early[3] * cos - early[4] * sin)

@@ -106,13 +106,13 @@ def _eliminate(
         if control.stop():
             break
         control.progress(f"measured curves without {EFFECTS[name].class_statement}", 0.3 + 0.06 * k)
-        kept = tuple(c for c in curves if c != name)
-        without = _fit(problem, (*effects, *kept), fit.coordinates(), settings.last_iterations)
+        others = tuple(c for c in curves if c != name)
+        without = _fit(problem, (*effects, *others), fit.coordinates(), settings.last_iterations)
         loss_without = _left_out_loss(problem, without, scale)
         rise, error = clustered_gain(loss_without, loss, problem.windows)
         log.info("without %s: the loss on left-out blocks rises by %.1f standard errors", name, rise / error)
         if rise < settings.keep_z_min * error:
-            fit, curves, loss = without, kept, loss_without
+            fit, curves, loss = without, others, loss_without
             rejected.append(RejectedCurves((name,), rise / error, settings.keep_z_min))
     return fit, curves, tuple(rejected)
 

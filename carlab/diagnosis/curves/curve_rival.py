@@ -49,9 +49,9 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         (Condition("rivals.curve_z_min", gain / error, settings.curve_z_min, above=False),),
         (Condition("rivals.min_curve_share", share, settings.min_curve_share, above=False),),
     )
-    stand = control.effects_stand(contained, alternatives, len(found.effects))
+    confirmed = control.are_confirmed(contained, alternatives, len(found.effects))
     log.info("curve in place of %s: %.2f of its gain, z %.1f", ", ".join(contained), share, gain / error)
-    return None if stand else rival
+    return None if confirmed else rival
 
 
 def curve_in_addition(problem: SearchProblem, found: SearchResult, names: tuple[str, ...]) -> RivalPhysics:

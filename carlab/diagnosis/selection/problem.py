@@ -204,12 +204,12 @@ class RunControl:
     ends_search: Callable[[], bool] = lambda: False
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
 
-    def effects_stand(self, effects: Sequence[str], alternatives: Alternatives, count: int) -> bool:
-        """Whether accepted effects, of ``count``, stand together; records the decision about each of them."""
-        stand = passes(alternatives)
+    def are_confirmed(self, effects: Sequence[str], alternatives: Alternatives, count: int) -> bool:
+        """Whether one of the alternatives holds for accepted effects (of ``count``); records this for each of them."""
+        confirmed = passes(alternatives)
         for name in effects:
-            self.record(Decision("stand", name, alternatives, stand, count))
-        return stand
+            self.record(Decision("stand", name, alternatives, confirmed, count))
+        return confirmed
 
 
 def numbers_of(effect: str) -> list[EffectParameter]:

@@ -1,7 +1,7 @@
 """Restarts of a fit from perturbed parameters (multistart), because its cost has several local minima.
 
 Forward selection begins each fit at the parameters of the fit before. So it may end in a minimum near parameters that
-are right only without the further effects. Effects then appear without influence, or as proxies of others.
+are right only without the further effects. Then effects seem to have no influence, or are proxies of others.
 """
 
 from __future__ import annotations
