@@ -81,11 +81,15 @@ def range_ratio(scored: ScoredSearch, effect: str) -> float:
 def identity_distance(scored: ScoredSearch, effect: str) -> float:
     """Mahalanobis distance of the effect's numbers from those of the car file, or else from their identities.
 
-    The covariance is that of the fit. The distance is infinite for an effect with a number without a finite identity,
-    with a number at the other end of its range, or with another form than in the car file.
+    The covariance is that of the fit. Place and radius of a disc have no identity: the effect is absent at any place if
+    its other numbers are at their identities. So they count only where the car file states the effect. The distance is
+    infinite for an effect with a number without a finite identity, with a number at the other end of its range, or with
+    another form than in the car file.
     """
-    numbers = {f"effects.{effect}.{p.name}": p for p in EFFECTS[effect].parameters}
     is_stated = effect in scored.problem.nominal.effects
+    without_identity = () if is_stated else EFFECTS[effect].disc_parameters
+    parameters = (p for p in EFFECTS[effect].parameters if p.name not in without_identity)
+    numbers = {f"effects.{effect}.{p.name}": p for p in parameters}
     if not is_stated and any(p.identity is None or math.isinf(p.identity) for p in numbers.values() if not p.choices):
         return math.inf
     fit = scored.fit

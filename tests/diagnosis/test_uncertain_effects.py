@@ -88,6 +88,19 @@ def test_distance_of_two_numbers_uses_their_correlation() -> None:
     assert identity_distance(scored, "steering_rate_limit") == np.inf
 
 
+@pytest.mark.parametrize(("is_stated", "expected"), [(False, 0.25), (True, np.hypot(0.25, 30.0))])
+def test_place_of_a_patch_counts_only_if_the_car_file_states_it(is_stated: bool, expected: float) -> None:
+    """The loss of grip is a quarter of its standard deviation; the place is 30 standard deviations away."""
+    values = {"low_friction_patch": {"x": 0.0, "y": 0.0, "radius": 0.5, "loss": 0.0}}
+    car = replace(CAR, effects=values if is_stated else {})
+    free = effect_parameters("low_friction_patch", car)
+    covariance = np.diag([0.01, 0.01, 0.01, 0.16])
+    fit = Fit(car, free, np.array([3.0, 0.0, 0.0, 0.1]), 0.0, np.zeros(1), covariance)
+    problem = SearchProblem(car, None, np.ones(6), np.ones(6), {})  # type: ignore[arg-type]
+    scored = ScoredSearch(problem, None, None, fit, {}, True)  # type: ignore[arg-type]
+    assert identity_distance(scored, "low_friction_patch") == pytest.approx(expected)
+
+
 def test_distance_from_the_numbers_and_the_form_of_the_car_file() -> None:
     stated = replace(CAR, effects={"torque_steer": {"coefficient": 0.1, "source": 1.0}})
     problem = SearchProblem(stated, None, np.ones(6), np.ones(6), {})  # type: ignore[arg-type]
