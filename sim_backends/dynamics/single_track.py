@@ -253,6 +253,8 @@ class SingleTrack:
             grip_front=self.front_mu,
             grip_rear=self.rear_mu,
             full_drive=self.drive_gain,
+            damping=self.damping,
+            rear_stiffness=self.rear_stiffness,
             drive=drive,
             states=dict(zip(self.extra_states, state[6:], strict=False)),
             stiff=stiff,

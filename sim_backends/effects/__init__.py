@@ -3,11 +3,11 @@
 To add your own effect, write its class and call ``sim_backends.registry.register``. To add an effect to the package,
 list it here.
 
-Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity,
-offset) and throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
-asymmetry, drag brake, saturation) -> driven axle (speed controller, traction limit, wheel slip) -> body (resistances,
-slope, bias, moments) -> load transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is measured (marker
-offset, yaw misalignment, velocity filter, latency). Within a group: by ``order``, then by id.
+Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity, offset) and
+throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake asymmetry,
+drag brake, saturation) -> driven axle (combined slip, speed controller, traction limit, wheel slip) -> body
+(resistances, slope, bias, moments) -> load transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is
+measured (marker offset, yaw misalignment, velocity filter, latency). Within a group: by ``order``, then by id.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from sim_backends.effects.base import (
     ObservationEffect,
 )
 from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDamping
+from sim_backends.effects.combined_slip import CombinedSlip
 from sim_backends.effects.curves import CURVES, MeasuredCurve
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
 from sim_backends.effects.disturbances import BODY_FORCE_PARAMETERS, DISTURBANCES, DRIFTING_PARAMETERS, Disturbance
@@ -87,6 +88,7 @@ _ALL: tuple[Effect, ...] = (
     CorneringDrag(),
     TyreSaturation(),
     FrictionEllipse(),
+    CombinedSlip(),
     LongitudinalSlip(),
     TyreRelaxation(),
     LoadTransfer(),

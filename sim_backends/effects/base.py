@@ -224,7 +224,8 @@ class Forces:
     forces [N] in the body frame (side forces in the wheel frame, positive left), moment [N m] about the centre of mass,
     wheel_angle [rad], throttle [1], mass [kg], loads of the axles [N], friction coefficients ``grip_front`` and
     ``grip_rear`` [1]. ``front_axle`` and ``rear_axle`` are distances from the centre of mass [m]. ``full_drive`` is the
-    car file's motor force at full throttle, ``drive`` the motor's force, ``axle_force`` the F_x of the driven axle
+    car file's motor force at full throttle, ``damping`` its decrease per speed [N s/m], ``rear_stiffness`` the slope of
+    the rear tyre curve, B C [1/rad], ``drive`` the motor's force, ``axle_force`` the F_x of the driven axle
     (drive less damping), ``demand`` the same before wheel slip, ``front_force`` the part of ``axle_force`` at the front
     wheels, along them (None: rear-wheel drive), ``force_x`` all longitudinal forces but the tyres' side forces.
     ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are the extra
@@ -251,6 +252,8 @@ class Forces:
     grip_front: Value
     grip_rear: Value
     full_drive: Value
+    damping: Value
+    rear_stiffness: Value
     drive: Value = 0.0
     demand: Value = 0.0
     axle_force: Value = 0.0

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import RegularGridInterpolator
+from scipy.optimize import brentq
 
 from carlab.core.quantities import Action, CarState
 from sim_backends.car_parameters import SimulatorConfig
@@ -42,6 +43,12 @@ CASES = {
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
     "all_wheel_drive_with_ellipse": {"all_wheel_drive": {"share": 0.6}, "friction_ellipse": {"scale": 0.7}},
     "all_wheel_drive_with_transfer": {"all_wheel_drive": {"share": 0.5}, "load_transfer": {"height": 0.06}},
+    "spinning_wheels": {"combined_slip": {"grip_ratio": 0.5}},
+    "spinning_wheels_with_transfer": {"combined_slip": {"grip_ratio": 0.6}, "load_transfer": {"height": 0.06}},
+    "spinning_wheels_of_a_limited_motor": {
+        "combined_slip": {"grip_ratio": 0.8},
+        "speed_controller": {"forward_force": 2.4, "backward_force": 1.0},
+    },
     "limited_ellipse": {"friction_ellipse": {"scale": 0.9, "action": "limits"}},
     "torque_with_traction": {
         "torque_steer": {"coefficient": -0.1, "source": "force"},
@@ -125,6 +132,20 @@ def tyre_map_at(e, name, acceleration, slip):
     return float(RegularGridInterpolator((knots, SLIPS), grid)(within)[0])
 
 
+def spinning_rims(e, p, vx, vy, r, demand, grip):
+    """Force along the car [N] and share of the side force, of rims that balance motor and tyres."""
+    speed, slope = max(abs(vx), 0.3), p.rear_b * p.rear_c
+    across = slope * (vy - p.rear_axle_m * r) / speed
+    peak = e["combined_slip"]["grip_ratio"] * grip
+
+    def force(rims):
+        along = slope * rims / speed
+        return peak * along / math.hypot(1.0, across, along)
+
+    rims = brentq(lambda w: force(w) + p.damping_nspm * w - demand, 0.0, 100.0, xtol=1e-14)
+    return force(rims), math.hypot(1.0, across) / math.hypot(1.0, across, slope * rims / speed)
+
+
 def reference_rates(t, s, d, u, p, e):
     """[x, y, yaw, vx, vy, r, F_front, F_rear, rim speed, roll, roll rate] by the catalogue's equations."""
     x, y, yaw, vx, vy, r, lag_front, lag_rear, rim, roll, roll_rate = s
@@ -157,10 +178,13 @@ def reference_rates(t, s, d, u, p, e):
     if has("drive_change"):
         drive *= 1 + e["drive_change"]["share"]
     demand = drive - p.damping_nspm * vx
-    if has("speed_controller"):
+
+    def controlled(force):
+        if not has("speed_controller"):
+            return force
         q = e["speed_controller"]
-        limit, shape = q["forward_force" if demand > 0 else "backward_force"], 1 - q.get("roundness", 0)
-        demand = math.copysign(smaller_root(shape, abs(demand), limit), demand)
+        limit, shape = q["forward_force" if force > 0 else "backward_force"], 1 - q.get("roundness", 0)
+        return math.copysign(smaller_root(shape, abs(force), limit), force)
 
     body_x = body_y = moment = 0.0
     if has("rolling_resistance"):
@@ -204,13 +228,17 @@ def reference_rates(t, s, d, u, p, e):
     transferred_load, force = 0.0, demand
     for _ in range(60):  # fixed-point iteration of load transfer and traction limit
         force = demand
+        if has("combined_slip"):
+            transmitted, _ = spinning_rims(e, p, vx, vy, r, abs(demand), mu_rear * (z_rear + transferred_load))
+            force = math.copysign(transmitted, demand)
+        force = controlled(force)
         if has("traction_limit"):
             q = e["traction_limit"]
             grip = mu_rear * (z_rear + transferred_load) + (
                 mu_front * (z_front - transferred_load) if q.get("axle") == "all" else 0.0
             )
             limit, shape = q["share"] * grip, 1.0 - q.get("roundness", 0.0)
-            force = math.copysign(smaller_root(shape, abs(demand), limit), demand)
+            force = math.copysign(smaller_root(shape, abs(force), limit), force)
         at_front = e["all_wheel_drive"]["share"] * force * (math.cos(d) - 1) if has("all_wheel_drive") else 0.0
         m_ax = force + at_front + body_x - front_each * (z_front - transferred_load) * math.sin(d)
         before, transferred_load = transferred_load, m_ax * height / (a + b)
@@ -229,8 +257,13 @@ def reference_rates(t, s, d, u, p, e):
     if has("longitudinal_slip"):
         q = e["longitudinal_slip"]
         limit = mu_rear * z_rear
-        force = limit * math.tanh(q["stiffness"] * (rim - vx) / max(abs(vx), 0.3) / limit)
-        rim_rate = RADIUS**2 / q["inertia"] * (demand - force)
+        at_wheels, force = force, limit * math.tanh(q["stiffness"] * (rim - vx) / max(abs(vx), 0.3) / limit)
+        rim_rate = RADIUS**2 / q["inertia"] * (at_wheels - force)
+    if has("combined_slip"):
+        transmitted, side_share = spinning_rims(e, p, vx, vy, r, abs(demand), mu_rear * z_rear)
+        if abs(force) < 0.9999 * transmitted:  # the motor's limit, not the tyres'
+            side_share = math.cos(math.asin(force / (e["combined_slip"]["grip_ratio"] * mu_rear * z_rear)))
+        f_rear *= side_share
     front_share = e["all_wheel_drive"]["share"] if has("all_wheel_drive") else 0.0
     if has("friction_ellipse"):
         q = e["friction_ellipse"]

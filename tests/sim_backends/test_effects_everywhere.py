@@ -44,6 +44,7 @@ IDS = [
     "cornering_drag",
     "tyre_saturation",
     "friction_ellipse",
+    "combined_slip",
     "longitudinal_slip",
     "tyre_relaxation",
     "load_transfer",

@@ -54,6 +54,7 @@ def library(data: Prepared) -> dict[str, Term]:
         "battery_sag": _command_term_of_time(lambda t: 1.0 - 0.002 * t),
         "friction_drift": _grip(lambda s: (1.0 + 0.002 * s.t_s, 1.0 + 0.002 * s.t_s)),
         "friction_ellipse": _grip(lambda s: (1.0, _combined(s, 0.3))),
+        "combined_slip": _spinning,
         "load_transfer": _grip(lambda s: _transfer(s, 0.05)),
         "aerodynamic_downforce": _grip(lambda s: (_pressed(s), _pressed(s))),
         "marker_offset:ahead": _observed(lambda v, rate: np.stack([0 * v[:, 2], v[:, 2], 0 * v[:, 2]], axis=1), 0.01),
@@ -163,6 +164,15 @@ def _combined(s: Steps, scale: float) -> FloatArray:
     drive_n = s.car.drive_gain * _throttle(s)
     share = np.clip(scale * drive_n / (s.car.mu_rear * s.car.load_rear), -0.9, 0.9)
     return np.asarray(np.sqrt(1.0 - share**2))
+
+
+def _spinning(s: Steps) -> FloatArray:
+    """Driven wheels that transmit 0.8 of the largest force of the motor, and lose side force near this limit."""
+    force = s.car.drive_gain * _throttle(s) - s.car.damping * s.middle[:, 3]
+    limit = 0.8 * float(np.quantile(np.abs(force), 0.99))
+    transmitted = np.clip(force, -0.9 * limit, 0.9 * limit)
+    lost = np.stack([transmitted - force, 0.0 * force, 0.0 * force], axis=1) / s.car.mass
+    return np.asarray(lost + _grip(lambda _: (1.0, np.sqrt(1.0 - (transmitted / limit) ** 2)))(s))
 
 
 def _forward_acceleration(s: Steps) -> FloatArray:

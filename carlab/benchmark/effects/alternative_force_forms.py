@@ -7,7 +7,16 @@ from collections.abc import Callable
 
 from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, heading, hook, plain, signed
 from carlab.benchmark.effects.force_forms import STICTION_MPS
-from carlab.benchmark.effects.tyre_forms import driven_front, driven_wheels, other_tyres, placed, saturating, slipping
+from carlab.benchmark.effects.tyre_forms import (
+    driven_front,
+    driven_wheels,
+    other_tyres,
+    placed,
+    saturating,
+    slipping,
+    spinning,
+    spinning_wheels,
+)
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.physics import Instant, World
 
@@ -238,6 +247,7 @@ FORMS = (
     Form("tyre_saturation", "other", saturating, other_tyres(brush_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("all_wheel_drive", "other", plain("share"), driven_front(slipping_clutch), 0.1, 1.0),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
+    Form("combined_slip", "other", spinning, spinning_wheels(brush_shape(1.0, 1.0)), 0.6, 3.0),
     Form("longitudinal_slip", "other", slipping, driven_wheels(brush_shape(1.0, 1.0)), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),
     Form("load_transfer", "other", plain("height"), pitching, 0.02, 0.2),

@@ -41,6 +41,7 @@ CONFUSABLE: dict[str, tuple[str, ...]] = {
     "cornering_drag": (),
     "tyre_saturation": ("steering_nonlinearity",),
     "friction_ellipse": ("load_transfer",),
+    "combined_slip": ("friction_ellipse", "traction_limit", "speed_controller", "longitudinal_slip"),
     "longitudinal_slip": ("motor_lag", "traction_limit"),
     "tyre_relaxation": ("steering_lag",),
     "load_transfer": ("friction_ellipse",),

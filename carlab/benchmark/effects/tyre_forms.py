@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from scipy.optimize import brentq
+
 from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, hook, plain, signed
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
-from carlab.benchmark.world.physics import Instant, World, pacejka_shape
+from carlab.benchmark.world.physics import SLIP_FLOOR_MPS, Instant, World, pacejka_shape
 
 WHEEL_RADIUS_M = 0.033  # the catalogue and the car file give none; that of a 1:10 touring car
 
@@ -87,6 +89,48 @@ def driven_wheels(curve: Callable[[float], float]) -> Attach:
             now.fx = force
 
         world.hooks["limit"].append(spin)
+
+    return attach
+
+
+def spinning_wheels(shape: Callable[[float], float]) -> Attach:
+    """Driven wheels without inertia whose tyres' force points along their slip.
+
+    ``shape`` goes from slope one at no slip to one at the limit. The rims are as fast as the motor needs for the tyres'
+    force; a limit of the motor that acts later slows them down.
+    """
+
+    def attach(world: World, p: Parameters) -> None:
+        car = world.car
+        slope = car.b_rear * car.c_rear
+        rims = [0.0]
+
+        def slips(now: Instant, slip_speed: float) -> tuple[float, float]:
+            speed = max(abs(now.vx), SLIP_FLOOR_MPS)
+            return slope * slip_speed / speed, slope * (now.vy - car.rear_axle * now.r) / speed
+
+        def force(now: Instant, slip_speed: float) -> float:
+            along, across = slips(now, slip_speed)
+            size = math.hypot(along, across)
+            return p["grip_ratio"] * now.mu_r * now.fz_r * shape(size) * along / size if along > 0.0 else 0.0
+
+        def balance(now: Instant, wanted: float, damping: float) -> float:
+            most = wanted / car.damping
+            return float(brentq(lambda s: damping * s + force(now, s) - wanted, 0.0, most, xtol=1e-13)) if most else 0.0
+
+        def spin(now: Instant) -> None:
+            rims[0] = balance(now, abs(now.fx), car.damping)
+            now.fx = math.copysign(force(now, rims[0]), now.fx)
+
+        def share(now: Instant) -> None:
+            is_limited = abs(now.fx) < (1.0 - 1e-9) * force(now, rims[0])
+            along, across = slips(now, balance(now, abs(now.fx), 0.0) if is_limited else rims[0])
+            across = max(abs(across), 1e-9)
+            size = math.hypot(along, across)
+            now.fr *= shape(size) / size * across / shape(across)
+
+        world.hooks["limit"].insert(0, spin)
+        world.hooks["tyre"].insert(0, share)
 
     return attach
 
@@ -172,6 +216,11 @@ def slipping(size: float, draw: Draw) -> dict[str, float]:
     return {"inertia": 2e-4 * size, "stiffness": 40.0 / max(size, 1e-9)}
 
 
+def spinning(size: float, draw: Draw) -> dict[str, float]:
+    """Grip along over grip across, so that the limit is the largest drive force over the size."""
+    return {"grip_ratio": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(size, 1e-6)}
+
+
 def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
     """Natural frequency [Hz], damping ratio and loss of grip."""
     return {"frequency": 1.5 + 2.5 * draw.shares[0], "damping": 0.2 + 0.4 * draw.shares[1], "loss": size}
@@ -181,6 +230,7 @@ FORMS = (
     Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda fx, share, car: share * fx), 0.1, 1.0),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
+    Form("combined_slip", "catalogue", spinning, spinning_wheels(pacejka_shape(1.0, 1.0)), 0.6, 3.0),
     Form("longitudinal_slip", "catalogue", slipping, driven_wheels(math.tanh), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),
     Form("load_transfer", "catalogue", plain("height"), load_transfer, 0.02, 0.2),

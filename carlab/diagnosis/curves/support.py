@@ -104,7 +104,8 @@ def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Force
         wheel_angle=angle, wheel_sin=np.sin(angle), wheel_cos=np.cos(angle), throttle=commands[1],
         mass=parameters.mass_kg, front_axle=parameters.front_axle_m, rear_axle=parameters.rear_axle_m,
         load_front=zero, load_rear=zero, grip_front=zero, grip_rear=zero,
-        full_drive=np.full_like(vx, parameters.drive_gain_n), axle_force=parameters.mass_kg * acceleration,
+        full_drive=np.full_like(vx, parameters.drive_gain_n), damping=zero, rear_stiffness=zero,
+        axle_force=parameters.mass_kg * acceleration,
     )  # fmt: skip
 
 

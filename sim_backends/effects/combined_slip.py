@@ -1,0 +1,115 @@
+"""Combined slip of the driven tyres: wheels that spin or lock transmit limited force and lose side force."""
+
+from __future__ import annotations
+
+import math
+
+from sim_backends.array_ops import Ops, Value
+from sim_backends.effects.base import (
+    SLIP_FLOOR_MPS,
+    Confusable,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    Parameters,
+)
+
+MAX_GRIP_RATIO = 1e6
+"""Ratios above this value are inactive."""
+MIN_GRIP_N, MIN_MOTOR_SLOPE_N = 1e-3, 1e-4
+"""They keep quotients finite."""
+_HALLEY_STEPS = 3
+_PEAK, _SIDE_SHARE2 = "combined_slip.peak", "combined_slip.side_share2"
+
+
+class CombinedSlip(DynamicsEffect):
+    """``F_x = P k / sqrt(1 + z^2 + k^2)`` with ``P = grip_ratio mu F_z``, at the rear tyres, and less side force.
+
+    k and z are the slip along and across the car, times the slope B C of the tyre curve: ``k = B C s / V``,
+    ``z = B C (vy - l_r r) / V``, ``V = max(|vx|, 0.3 m/s)``, where s [m/s] is the speed of the rims relative to the
+    car. The side force is ``F_y sqrt((1 + z^2) / (1 + z^2 + k^2))``, F_y being that without longitudinal slip. So both
+    forces point along one slip vector; the shape is Pacejka's sin(C atan(x)) with C = 1 (combined slip: Pacejka 2012,
+    "Tire and Vehicle Dynamics", ch. 3 and 4).
+
+    The wheels have no inertia: s is in equilibrium with the motor, whose force falls as the wheels spin faster than the
+    car, ``F_x = drive - damping (vx + s)``. With more drive force than grip, s grows until the motor is at its speed,
+    and a braked wheel locks. A limit of the motor's force that is smaller than F_x ends the slip.
+
+    With an infinite ratio the tyres transmit the motor's force without slip, as in the base model.
+    """
+
+    id = "combined_slip"
+    represented_by = "rear_tyre_map"
+    command = "throttle"
+    name = "driven wheels that spin and lock, with less side force"
+    summary = "Driven wheels spin or lock: their tyres transmit limited force, and lose side force while they slip."
+    sentence = (
+        "the driven wheels spin and lock: along the car their tyres transmit at most {grip_ratio} times their grip "
+        "across it, and they lose side force while they slip"
+    )
+    refuted_if = "the wheels neither spin nor lock when full throttle is applied or released"
+    order = 30
+    base_models = ("dynamic", "linear_tyre", "blend")
+    parameters = (EffectParameter("grip_ratio", "1", math.inf, 0.0, math.inf, 1.0),)
+    confusable = (
+        Confusable(
+            "friction_ellipse",
+            "throttle_ramp",
+            "an ellipse lowers the side force and leaves the drive force as it is; spinning wheels limit the drive too",
+        ),
+        Confusable(
+            "traction_limit",
+            "throttle_ramp",
+            "a limit of traction alone leaves the side force as it is; spinning wheels lose it",
+        ),
+        Confusable(
+            "speed_controller",
+            "throttle_steps",
+            "a controller with limited force leaves the side force as it is; spinning and locked wheels lose it",
+        ),
+        Confusable(
+            "longitudinal_slip",
+            "throttle_steps",
+            "wheels with inertia need time to accelerate; without inertia the force is limited at once",
+        ),
+    )
+
+    def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """The tyres' force instead of the motor's."""
+        slips = values["grip_ratio"] < MAX_GRIP_RATIO
+        ratio = ops.where(slips, values["grip_ratio"], 1.0)
+        peak = ops.at_least(ratio * forces.grip_rear * forces.load_rear, MIN_GRIP_N)
+        slip = _scaled_slip(ops, forces, peak)
+        side_share2 = 1.0 / (1.0 + slip * slip)
+        force = ops.sign(forces.axle_force) * peak * slip * ops.sqrt(side_share2)
+        forces.axle_force = ops.where(slips, force, forces.axle_force)
+        forces.rates[_PEAK], forces.rates[_SIDE_SHARE2] = peak, ops.where(slips, side_share2, 1.0)
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Reduce the side force; a limit of the motor that has reduced F_x since then leaves more of it."""
+        used, spinning2 = forces.axle_force / forces.rates[_PEAK], forces.rates[_SIDE_SHARE2]
+        sticking2 = 1.0 - used * used
+        forces.side_rear = forces.side_rear * ops.sqrt(ops.where(sticking2 > spinning2, sticking2, spinning2))
+
+
+def _scaled_slip(ops: Ops, forces: Forces, peak: Value) -> Value:
+    """Size of ``u = k / sqrt(1 + z^2)``, which is F_x over side force, each over its own limit.
+
+    It solves ``e u + P u / sqrt(1 + u^2) = |D|`` with the motor's force D at the speed of the car and its fall
+    ``e = damping V sqrt(1 + z^2) / (B C)`` by Halley's method from a lower bound of the only root. For e above 0.02 P
+    the error of F_x is below 1e-11 P.
+    """
+    speed = ops.at_least(ops.abs(forces.vx), SLIP_FLOOR_MPS)
+    across = forces.rear_stiffness * (forces.vy - forces.rear_axle * forces.yaw_rate) / speed
+    fall = forces.damping * speed * ops.sqrt(1.0 + across * across) / forces.rear_stiffness
+    fall = ops.at_least(fall, MIN_MOTOR_SLOPE_N)
+    demand = ops.abs(forces.axle_force)
+    sticking, spinning = demand / (fall + peak), (demand - peak) / fall
+    slip = ops.where(sticking > spinning, sticking, spinning)
+    for _ in range(_HALLEY_STEPS):
+        share = 1.0 / ops.sqrt(1.0 + slip * slip)
+        error = fall * slip + peak * slip * share - demand
+        slope = fall + peak * share * share * share
+        curvature = -3.0 * peak * slip * share * share * share * share * share
+        slip = ops.at_least(slip - 2.0 * error * slope / (2.0 * slope * slope - error * curvature), 0.0)
+    return slip
