@@ -100,33 +100,39 @@ def spinning_wheels(shape: Callable[[float], float]) -> Attach:
     force; a limit of the motor that acts later slows them down.
     """
 
+    hypot = math.hypot
+
     def attach(world: World, p: Parameters) -> None:
         car = world.car
         slope = car.b_rear * car.c_rear
-        rims = [0.0]
+        at_rims = [0.0, 0.0]
 
-        def slips(now: Instant, slip_speed: float) -> tuple[float, float]:
-            speed = max(abs(now.vx), SLIP_FLOOR_MPS)
-            return slope * slip_speed / speed, slope * (now.vy - car.rear_axle * now.r) / speed
+        def balance(now: Instant, wanted: float, damping: float) -> tuple[float, float]:
+            """Scaled slip along the car, and the tyres' force [N] where it equals the motor's."""
+            per_speed = slope / max(abs(now.vx), SLIP_FLOOR_MPS)
+            across = per_speed * (now.vy - car.rear_axle * now.r)
+            top, fall = p["grip_ratio"] * now.mu_r * now.fz_r, damping / per_speed
 
-        def force(now: Instant, slip_speed: float) -> float:
-            along, across = slips(now, slip_speed)
-            size = math.hypot(along, across)
-            return p["grip_ratio"] * now.mu_r * now.fz_r * shape(size) * along / size if along > 0.0 else 0.0
+            def force(along: float) -> float:
+                size = hypot(along, across)
+                return top * shape(size) * along / size
 
-        def balance(now: Instant, wanted: float, damping: float) -> float:
-            most = wanted / car.damping
-            return float(brentq(lambda s: damping * s + force(now, s) - wanted, 0.0, most, xtol=1e-13)) if most else 0.0
+            most = wanted * per_speed / car.damping
+            if most < 1e-9:
+                return 0.0, 0.0
+            along = brentq(lambda k: fall * k + force(k) - wanted, 1e-12, most, xtol=1e-12)
+            return along, force(along)
 
         def spin(now: Instant) -> None:
-            rims[0] = balance(now, abs(now.fx), car.damping)
-            now.fx = math.copysign(force(now, rims[0]), now.fx)
+            at_rims[:] = balance(now, abs(now.fx), car.damping)
+            now.fx = math.copysign(at_rims[1], now.fx)
 
         def share(now: Instant) -> None:
-            is_limited = abs(now.fx) < (1.0 - 1e-9) * force(now, rims[0])
-            along, across = slips(now, balance(now, abs(now.fx), 0.0) if is_limited else rims[0])
-            across = max(abs(across), 1e-9)
-            size = math.hypot(along, across)
+            along, force = at_rims
+            if abs(now.fx) < (1.0 - 1e-9) * force:
+                along, _ = balance(now, abs(now.fx), 0.0)
+            across = slope * max(abs(now.vy - car.rear_axle * now.r), 1e-9) / max(abs(now.vx), SLIP_FLOOR_MPS)
+            size = hypot(along, across)
             now.fr *= shape(size) / size * across / shape(across)
 
         world.hooks["limit"].insert(0, spin)
