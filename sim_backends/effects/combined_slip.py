@@ -79,9 +79,9 @@ class CombinedSlip(DynamicsEffect):
         slips = values["grip_ratio"] < MAX_GRIP_RATIO
         ratio = ops.where(slips, values["grip_ratio"], 1.0)
         peak = ops.at_least(ratio * forces.grip_rear * forces.load_rear, MIN_GRIP_N)
-        slip = _scaled_slip(ops, forces, peak)
-        side_share2 = 1.0 / (1.0 + slip * slip)
-        force = ops.sign(forces.axle_force) * peak * slip * ops.sqrt(side_share2)
+        u = _scaled_slip(ops, forces, peak)
+        side_share2 = 1.0 / (1.0 + u * u)
+        force = ops.sign(forces.axle_force) * peak * u * ops.sqrt(side_share2)
         forces.axle_force = ops.where(slips, force, forces.axle_force)
         forces.rates[_PEAK], forces.rates[_SIDE_SHARE2] = peak, ops.where(slips, side_share2, 1.0)
 
@@ -93,23 +93,26 @@ class CombinedSlip(DynamicsEffect):
 
 
 def _scaled_slip(ops: Ops, forces: Forces, peak: Value) -> Value:
-    """Size of ``u = k / sqrt(1 + z^2)``, which is F_x over side force, each over its own limit.
-
-    It solves ``e u + P u / sqrt(1 + u^2) = |D|`` with the motor's force D at the speed of the car and its fall
-    ``e = damping V sqrt(1 + z^2) / (B C)`` by Halley's method from a lower bound of the only root. For e above 0.02 P
-    the error of F_x is below 1e-11 P.
-    """
+    """Size of ``u = k / sqrt(1 + z^2)`` at which tyres with the limit ``peak`` [N] and motor are in equilibrium."""
     speed = ops.at_least(ops.abs(forces.vx), SLIP_FLOOR_MPS)
     across = forces.rear_stiffness * (forces.vy - forces.rear_axle * forces.yaw_rate) / speed
     fall = forces.damping * speed * ops.sqrt(1.0 + across * across) / forces.rear_stiffness
-    fall = ops.at_least(fall, MIN_MOTOR_SLOPE_N)
-    demand = ops.abs(forces.axle_force)
+    return solve_slip(ops, ops.abs(forces.axle_force), peak, ops.at_least(fall, MIN_MOTOR_SLOPE_N))
+
+
+def solve_slip(ops: Ops, demand: Value, peak: Value, fall: Value) -> Value:
+    """Solve ``fall u + peak u / sqrt(1 + u^2) = demand`` for u, by Halley's method from a lower bound of the only root.
+
+    All arguments are in N and positive. For ``fall`` above 0.02 ``peak`` the error of the force is below 1e-11
+    ``peak``, and for any above 0.001 ``peak`` below 1e-5 ``peak``.
+    """
     sticking, spinning = demand / (fall + peak), (demand - peak) / fall
-    slip = ops.where(sticking > spinning, sticking, spinning)
+    u = ops.where(sticking > spinning, sticking, spinning)
     for _ in range(_HALLEY_STEPS):
-        share = 1.0 / ops.sqrt(1.0 + slip * slip)
-        error = fall * slip + peak * slip * share - demand
-        slope = fall + peak * share * share * share
-        curvature = -3.0 * peak * slip * share * share * share * share * share
-        slip = ops.at_least(slip - 2.0 * error * slope / (2.0 * slope * slope - error * curvature), 0.0)
-    return slip
+        share = 1.0 / ops.sqrt(1.0 + u * u)
+        cubed = share * share * share
+        error = fall * u + peak * u * share - demand
+        slope = fall + peak * cubed
+        curvature = -3.0 * peak * u * cubed * share * share
+        u = ops.at_least(u - 2.0 * error * slope / (2.0 * slope * slope - error * curvature), 0.0)
+    return u

@@ -99,7 +99,6 @@ def spinning_wheels(shape: Callable[[float], float]) -> Attach:
     ``shape`` goes from slope one at no slip to one at the limit. The rims are as fast as the motor needs for the tyres'
     force; a limit of the motor that acts later slows them down.
     """
-
     hypot = math.hypot
 
     def attach(world: World, p: Parameters) -> None:
