@@ -43,12 +43,19 @@ class PairwiseResult:
 def choose_confusable(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> tuple[Model, PairwiseResult]:
-    """Replace effects of a model by confusable effects that predict left-out blocks better."""
+    """Replace effects of a model by confusable effects that predict left-out blocks better.
+
+    A replaced effect does not return: each comparison fits the alternative once more than the model, so two effects
+    that fit equally well would replace one another again and again.
+    """
     pairs = compare_pairs(problem, eliminated, control)
+    replaced: set[str] = set()
     for _ in eliminated.model.effects:
-        if not pairs.replacements or control.stop():
+        new = ((name, each) for name, each in pairs.replacements.items() if each.effect not in replaced)
+        if (replacement := next(new, None)) is None or control.stop():
             break
-        name, candidate = next(iter(pairs.replacements.items()))
+        name, candidate = replacement
+        replaced.add(name)
         log.info("%s replaces %s", candidate.effect, name)
         before = eliminated.model
         effects = tuple(candidate.effect if e == name else e for e in before.effects)

@@ -1,0 +1,40 @@
+"""Replacement of effects by confusable effects."""
+
+import numpy as np
+import pytest
+
+from carlab.diagnosis.selection import pairwise_tests
+from carlab.diagnosis.selection.elimination import EliminationResult
+from carlab.diagnosis.selection.pairwise_tests import PairwiseResult, choose_confusable
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import fit_base
+from carlab.prediction.windows import cut_windows, segments_of
+from sim_backends import SimulatorConfig
+from tests.helpers.recorded_drives import PERIOD_S, drive
+
+DELAY, LATENCY = "command_delay", "mocap_latency"
+
+
+def test_two_effects_that_fit_equally_well_do_not_replace_one_another_again_and_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Here each comparison prefers the alternative, as it does if further iterations lower the cost each time."""
+    car = SimulatorConfig(control_period_s=PERIOD_S)
+    windows = cut_windows(segments_of([drive(car, 20.0, 1)]), 0.8, 0.6)
+    problem = SearchProblem(car, windows, np.full(6, 1e-3), np.full(6, 1e-3), {})
+    base = fit_base(problem)
+    compared: list[tuple[str, ...]] = []
+
+    def compare(problem: SearchProblem, eliminated: EliminationResult, control: RunControl) -> PairwiseResult:
+        name = eliminated.model.effects[0]
+        compared.append(eliminated.model.effects)
+        other = LATENCY if name == DELAY else DELAY
+        return PairwiseResult(replacements={name: Candidate(other, base.fit, 1.0)})
+
+    monkeypatch.setattr(pairwise_tests, "compare_pairs", compare)
+    monkeypatch.setattr(pairwise_tests, "delete_each", lambda *_: {})
+    monkeypatch.setattr(pairwise_tests, "refit", lambda _, effects, fit, scale: Model(effects, fit, scale))
+    effects = (DELAY, "motor_lag", "steering_lag", "load_transfer")
+    model, _ = choose_confusable(problem, EliminationResult(Model(effects, base.fit, base.scale), {}), RunControl())
+    assert model.effects == (LATENCY, *effects[1:])
+    assert compared == [effects, model.effects]
