@@ -11,7 +11,7 @@ import pytest
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
-from carlab.diagnosis.identification.fit_parameters import FitParameter
+from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters
 from carlab.diagnosis.selection import candidates, moves
 from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
@@ -25,6 +25,7 @@ from tests.helpers.recorded_drives import PERIOD_S, drive
 
 LAG, BRAKE = "steering_lag", "brake_asymmetry"
 CAR = SimulatorConfig(control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
+RATIOS = DEFAULT.selection.limit_start_ratios
 STD = 3e-4 * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
 
 
@@ -81,9 +82,9 @@ def test_candidate_starts_at_the_values_of_a_fit_whose_effects_have_another_orde
 def test_fits_start_once_for_each_choice_if_one_other_number_is_free() -> None:
     size, choice = FitParameter("size", 0.0, 1.0, 0.0, 9.0), FitParameter("form", 0.0, 1.0, 0.0, 1.0, choice=True)
     starts = np.array([[3.0, 1.0], [1.0, 0.0], [2.0, 1.0]])
-    assert refit_module._distinct_starts((size, choice), starts).tolist() == [[3.0, 1.0], [1.0, 0.0]]
-    assert refit_module._distinct_starts((size,), starts[:, :1]).tolist() == [[3.0]]
-    assert refit_module._distinct_starts((size, size), starts).tolist() == starts.tolist()
+    assert refit_module._distinct_starts((size, choice), starts, RATIOS).tolist() == [[3.0, 1.0], [1.0, 0.0]]
+    assert refit_module._distinct_starts((size,), starts[:, :1], RATIOS).tolist() == [[3.0]]
+    assert refit_module._distinct_starts((size, size), starts, RATIOS).tolist() == starts.tolist()
 
 
 def test_fit_that_is_compared_ends_early_with_nearly_the_same_difference(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,3 +223,12 @@ def test_progress_of_a_step_does_not_go_back() -> None:
     assert shares == sorted(shares)
     step = 1.0 / problem.settings.selection.max_effects
     assert step <= shares[0] < shares[-1] < 2.0 * step
+
+
+@pytest.mark.parametrize("effect", ["combined_slip", "steering_rate_limit"])
+def test_fits_of_a_single_limit_also_begin_at_weaker_limits(effect: str) -> None:
+    """A strong limit raises the cost, because the other parameters fit the drive without the limit."""
+    (limit,) = effect_parameters(effect, CAR)
+    strong, weak = limit.coordinate(2.0), limit.coordinate(9.0)
+    starts = refit_module._distinct_starts((limit,), np.array([[strong], [weak]]), RATIOS)
+    assert limit.value(starts[:, 0]) == pytest.approx([2.0, 3.4, 6.0])

@@ -86,16 +86,16 @@ def _fit_from(
 def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult, iterations: int = 12) -> Candidate:
     """Fit the candidate together with ``model``, from the initial points of its screening.
 
-    The initial points are compared after a few iterations on part of the windows. Those of an effect with one number
-    differ in size alone, and fits from them end at the same minimum, so the best of them stands for all.
+    The initial points are compared after a few iterations on part of the windows (``_distinct_starts``).
     """
     fitter = problem.fitter(model.scale)
     effects = (*model.effects, screened.effect)
     config, free = problem.config_with(effects), problem.free_parameters(effects)
     before = _start(problem, model.effects, model.fit)
-    starts = [np.concatenate([before, s]) for s in _distinct_starts(free[len(before) :], screened.starts)]
+    settings = problem.settings.selection
+    own_starts = _distinct_starts(free[len(before) :], screened.starts, settings.limit_start_ratios)
+    starts = [np.concatenate([before, s]) for s in own_starts]
     if len(starts) > 1:
-        settings = problem.settings.selection
         few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale)
         tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
         starts = [min(tries, key=lambda f: f.cost).z]
@@ -116,8 +116,15 @@ def finish_refit(problem: SearchProblem, model: Model, begun: Candidate) -> Cand
     return Candidate(begun.effect, fit, cost - fit.cost)
 
 
-def _distinct_starts(own: Sequence[FitParameter], starts: FloatArray) -> FloatArray:
-    """The initial points (k, n) of an effect's parameters, one for each choice if a single other number is free."""
+def _distinct_starts(own: Sequence[FitParameter], starts: FloatArray, limit_ratios: Sequence[float]) -> FloatArray:
+    """The initial points (k, n) of an effect's parameters without those whose fits end at the same minimum.
+
+    Points of an effect with one number differ in size alone, so the best of them is sufficient for each choice. But a
+    strong limit can lead to a local minimum, because the other parameters are those of the model without the limit, so
+    weaker limits follow.
+    """
+    if len(own) == 1 and own[0].logarithmic:
+        return np.array([[own[0].coordinate(ratio * float(own[0].value(starts[0, 0])))] for ratio in limit_ratios])
     choices = np.array([f.choice for f in own], bool)
     if len(own) - choices.sum() > 1:
         return starts

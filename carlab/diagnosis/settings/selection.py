@@ -102,6 +102,8 @@ class SelectionSettings:
     max_start_windows: int = 180
     """Number of windows on which initial points are compared, as many as for screening; bounds the time. Fits from the
     best point use all windows."""
+    limit_start_ratios: tuple[float, ...] = (1.0, 1.7, 3.0)
+    """Initial values of an effect's only limit, over that of the best screening point [1]."""
     keep_z_min: float = 1.2
     """One of several effects is removed if its removal costs less than this on left-out blocks [standard errors]."""
     supported_z_min: float = 1.6449
