@@ -18,8 +18,8 @@ MAX_GRIP_RATIO = 1e6
 """Ratios above this value are inactive."""
 MIN_GRIP_N, MIN_MOTOR_SLOPE_N = 1e-3, 1e-4
 """They keep quotients finite."""
-_HALLEY_STEPS = 3
 _PEAK, _SIDE_SHARE2 = "combined_slip.peak", "combined_slip.side_share2"
+_SLIP, _FALL = "combined_slip.slip", "combined_slip.fall"
 
 
 class CombinedSlip(DynamicsEffect):
@@ -78,7 +78,7 @@ class CombinedSlip(DynamicsEffect):
         slips = values["grip_ratio"] < MAX_GRIP_RATIO
         ratio = ops.where(slips, values["grip_ratio"], 1.0)
         peak = ops.at_least(ratio * forces.grip_rear * forces.load_rear, MIN_GRIP_N)
-        u = _scaled_slip(ops, forces, peak)
+        u = forces.rates[_SLIP] = _scaled_slip(ops, forces, peak)
         side_share2 = 1.0 / (1.0 + u * u)
         force = ops.sign(forces.axle_force) * peak * u * ops.sqrt(side_share2)
         forces.axle_force = ops.where(slips, force, forces.axle_force)
@@ -92,22 +92,31 @@ class CombinedSlip(DynamicsEffect):
 
 
 def _scaled_slip(ops: Ops, forces: Forces, peak: Value) -> Value:
-    """Size of ``u = k / sqrt(1 + z^2)`` at which tyres with the limit ``peak`` [N] and motor are in equilibrium."""
-    speed = ops.at_least(ops.abs(forces.vx), SLIP_FLOOR_MPS)
-    across = forces.rear_stiffness * (forces.vy - forces.rear_axle * forces.yaw_rate) / speed
-    fall = forces.damping * speed * ops.sqrt(1.0 + across * across) / forces.rear_stiffness
-    return solve_slip(ops, ops.abs(forces.axle_force), peak, ops.at_least(fall, MIN_MOTOR_SLOPE_N))
+    """Size of ``u = k / sqrt(1 + z^2)`` at which tyres with the limit ``peak`` [N] and motor are in equilibrium.
 
-
-def solve_slip(ops: Ops, demand: Value, peak: Value, fall: Value) -> Value:
-    """Solve ``fall u + peak u / sqrt(1 + u^2) = demand`` for u, by Halley's method from a lower bound of the only root.
-
-    All arguments are in N and positive. For ``fall`` above 0.02 ``peak`` the error of the force is below 1e-11
-    ``peak``, and for any above 0.001 ``peak`` below 1e-5 ``peak``.
+    Load transfer repeats it with a slightly different limit; then it begins at the slip of the time before.
     """
+    demand = ops.abs(forces.axle_force)
+    if _SLIP in forces.rates:
+        return solve_slip(ops, demand, peak, forces.rates[_FALL], forces.rates[_SLIP], steps=1)
+    speed = ops.at_least(ops.abs(forces.vx), SLIP_FLOOR_MPS)
+    per_speed = forces.rear_stiffness / speed
+    across = per_speed * (forces.vy - forces.rear_axle * forces.yaw_rate)
+    fall = forces.damping * ops.sqrt(1.0 + across * across) / per_speed
+    fall = forces.rates[_FALL] = ops.at_least(fall, MIN_MOTOR_SLOPE_N)
     sticking, spinning = demand / (fall + peak), (demand - peak) / fall
-    u = ops.where(sticking > spinning, sticking, spinning)
-    for _ in range(_HALLEY_STEPS):
+    return solve_slip(ops, demand, peak, fall, ops.where(sticking > spinning, sticking, spinning), steps=3)
+
+
+def solve_slip(ops: Ops, demand: Value, peak: Value, fall: Value, start: Value, steps: int) -> Value:
+    """Solve ``fall u + peak u / sqrt(1 + u^2) = demand`` for u by Halley's method; it has one root.
+
+    All arguments but ``start`` are in N and positive. Three steps from the lower bound
+    ``max(demand / (fall + peak), (demand - peak) / fall)`` have an error of the force below 1e-11 ``peak`` for ``fall``
+    above 0.02 ``peak``, and below 1e-5 ``peak`` for ``fall`` above 0.001 ``peak``.
+    """
+    u = start
+    for _ in range(steps):
         share = 1.0 / ops.sqrt(1.0 + u * u)
         cubed = share * share * share
         error = fall * u + peak * u * share - demand

@@ -69,7 +69,8 @@ def test_slip_of_spinning_wheels_solves_the_equilibrium(rng):
         middle = 0.5 * (low + high)
         is_above = fall * middle + peak * middle / np.hypot(1.0, middle) > demand
         low, high = np.where(is_above, low, middle), np.where(is_above, middle, high)
-    u = solve_slip(ARRAYS, demand, peak, fall)
+    start = np.maximum(demand / (fall + peak), (demand - peak) / fall)
+    u = solve_slip(ARRAYS, demand, peak, fall, start, steps=3)
     error = np.abs(u / np.hypot(1.0, u) - high / np.hypot(1.0, high))
     assert error.max() < 1e-5
     assert error[fall > 0.02 * peak].max() < 1e-11
