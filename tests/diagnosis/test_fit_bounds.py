@@ -1,5 +1,6 @@
 """Bounds of fitted parameters: a simulator accepts the values that a fit may reach, and a fit reaches its minimum."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -161,3 +162,10 @@ def test_fit_with_parameters_at_their_bounds_reaches_the_minimum_of_scipy():
             assert covariance[k, k] > 0.0
             if f.name in at_bound:
                 assert not np.delete(covariance[k], k).any()
+
+
+def test_value_of_a_far_coordinate_is_its_bound():
+    """A long step of a fit must not overflow."""
+    limit = FitParameter("effects.combined_slip.grip_ratio", 1.0, 0.3, 0.06, 150.0, logarithmic=True)
+    with np.errstate(all="raise"):
+        assert limit.value(np.array([1e5, 1e-3])) == pytest.approx([150.0, math.exp(3e-4)])

@@ -31,7 +31,8 @@ TYRE_PARAMETERS = tuple(name for name in BASE_PARAMETERS if name.startswith("tyr
 MIN_POSITIVE_SHARE = 1e-3
 """Smallest value of a parameter that must be positive, over its typical size."""
 
-
+MAX_EXPONENT = 700.0
+"""Largest exponent of a finite number of double precision, rounded down."""
 DIFFERENCE_STEP = 0.02
 """Step of a coordinate for finite differences."""
 DELAY_DIFFERENCE_STEP = 0.3
@@ -73,7 +74,8 @@ class FitParameter:
         """Values at coordinates z, both (...)."""
         if self.choice:
             return np.asarray(np.round(np.clip(self.origin + z, self.low, self.high)))
-        raw = self.origin * np.exp(self.size * z) if self.logarithmic else self.origin + self.size * z
+        exponent = np.minimum(self.size * z, MAX_EXPONENT)
+        raw = self.origin * np.exp(exponent) if self.logarithmic else self.origin + self.size * z
         return np.asarray(np.clip(raw, self.low, self.high))
 
     def coordinate(self, value: float) -> float:
