@@ -19,7 +19,7 @@ MAX_GRIP_RATIO = 1e6
 MIN_GRIP_N, MIN_MOTOR_SLOPE_N = 1e-3, 1e-4
 """They keep quotients finite."""
 _PEAK, _SIDE_SHARE2 = "combined_slip.peak", "combined_slip.side_share2"
-_SLIP, _FALL = "combined_slip.slip", "combined_slip.fall"
+_SLIP, _MOTOR_SLOPE = "combined_slip.slip", "combined_slip.motor_slope"
 
 
 class CombinedSlip(DynamicsEffect):
@@ -87,9 +87,9 @@ class CombinedSlip(DynamicsEffect):
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Reduce the side force; a limit of the motor that has reduced F_x since then leaves more of it."""
-        used, spinning2 = forces.axle_force / forces.rates[_PEAK], forces.rates[_SIDE_SHARE2]
-        sticking2 = 1.0 - used * used
-        forces.side_rear = forces.side_rear * ops.sqrt(ops.where(sticking2 > spinning2, sticking2, spinning2))
+        used, by_slip2 = forces.axle_force / forces.rates[_PEAK], forces.rates[_SIDE_SHARE2]
+        by_force2 = 1.0 - used * used
+        forces.side_rear = forces.side_rear * ops.sqrt(ops.where(by_force2 > by_slip2, by_force2, by_slip2))
 
 
 def _scaled_slip(ops: Ops, forces: Forces, peak: Value) -> Value:
@@ -99,29 +99,29 @@ def _scaled_slip(ops: Ops, forces: Forces, peak: Value) -> Value:
     """
     demand = ops.abs(forces.axle_force)
     if _SLIP in forces.rates:
-        return solve_slip(ops, demand, peak, forces.rates[_FALL], forces.rates[_SLIP], steps=1)
+        return solve_slip(ops, demand, peak, forces.rates[_MOTOR_SLOPE], forces.rates[_SLIP], steps=1)
     speed = ops.at_least(ops.abs(forces.vx), SLIP_FLOOR_MPS)
     per_speed = forces.rear_stiffness / speed
     across = per_speed * (forces.vy - forces.rear_axle * forces.yaw_rate)
-    fall = forces.damping * ops.sqrt(1.0 + across * across) / per_speed
-    fall = forces.rates[_FALL] = ops.at_least(fall, MIN_MOTOR_SLOPE_N)
-    sticking, spinning = demand / (fall + peak), (demand - peak) / fall
-    return solve_slip(ops, demand, peak, fall, ops.where(sticking > spinning, sticking, spinning), steps=3)
+    slope = forces.damping * ops.sqrt(1.0 + across * across) / per_speed
+    slope = forces.rates[_MOTOR_SLOPE] = ops.at_least(slope, MIN_MOTOR_SLOPE_N)
+    rolling, spinning = demand / (slope + peak), (demand - peak) / slope
+    return solve_slip(ops, demand, peak, slope, ops.where(rolling > spinning, rolling, spinning), steps=3)
 
 
-def solve_slip(ops: Ops, demand: Value, peak: Value, fall: Value, start: Value, steps: int) -> Value:
-    """Solve ``fall u + peak u / sqrt(1 + u^2) = demand`` for u by Halley's method; it has one root.
+def solve_slip(ops: Ops, demand: Value, peak: Value, motor_slope: Value, start: Value, steps: int) -> Value:
+    """Solve ``motor_slope u + peak u / sqrt(1 + u^2) = demand`` for u by Halley's method; it has one root.
 
     All arguments but ``start`` are in N and positive. Three steps from the lower bound
-    ``max(demand / (fall + peak), (demand - peak) / fall)`` have an error of the force below 1e-11 ``peak`` for ``fall``
-    above 0.02 ``peak``, and below 1e-5 ``peak`` for ``fall`` above 0.001 ``peak``.
+    ``max(demand / (motor_slope + peak), (demand - peak) / motor_slope)`` have an error of the force below 1e-11
+    ``peak`` for ``motor_slope`` above 0.02 ``peak``, and below 1e-5 ``peak`` for ``motor_slope`` above 0.001 ``peak``.
     """
     u = start
     for _ in range(steps):
-        share = 1.0 / ops.sqrt(1.0 + u * u)
-        cubed = share * share * share
-        error = fall * u + peak * u * share - demand
-        slope = fall + peak * cubed
-        curvature = -3.0 * peak * u * cubed * share * share
-        u = ops.at_least(u - 2.0 * error * slope / (2.0 * slope * slope - error * curvature), 0.0)
+        cosine = 1.0 / ops.sqrt(1.0 + u * u)
+        cubed = cosine * cosine * cosine
+        error = motor_slope * u + peak * u * cosine - demand
+        first = motor_slope + peak * cubed
+        second = -3.0 * peak * u * cubed * cosine * cosine
+        u = ops.at_least(u - 2.0 * error * first / (2.0 * first * first - error * second), 0.0)
     return u

@@ -63,14 +63,15 @@ def test_a_limited_motor_does_not_spin_the_wheels():
 
 def test_slip_of_spinning_wheels_solves_the_equilibrium(rng):
     peak = 10.0 ** rng.uniform(-1.0, 2.0, 50_000)
-    fall, demand = peak * 10.0 ** rng.uniform(-3.0, 1.0, len(peak)), peak * 10.0 ** rng.uniform(-3.0, 2.0, len(peak))
-    low, high = np.zeros(len(peak)), demand / fall
+    motor_slope = peak * 10.0 ** rng.uniform(-3.0, 1.0, len(peak))
+    demand = peak * 10.0 ** rng.uniform(-3.0, 2.0, len(peak))
+    low, high = np.zeros(len(peak)), demand / motor_slope
     for _ in range(100):
         middle = 0.5 * (low + high)
-        is_above = fall * middle + peak * middle / np.hypot(1.0, middle) > demand
+        is_above = motor_slope * middle + peak * middle / np.hypot(1.0, middle) > demand
         low, high = np.where(is_above, low, middle), np.where(is_above, middle, high)
-    start = np.maximum(demand / (fall + peak), (demand - peak) / fall)
-    u = solve_slip(ARRAYS, demand, peak, fall, start, steps=3)
+    start = np.maximum(demand / (motor_slope + peak), (demand - peak) / motor_slope)
+    u = solve_slip(ARRAYS, demand, peak, motor_slope, start, steps=3)
     error = np.abs(u / np.hypot(1.0, u) - high / np.hypot(1.0, high))
     assert error.max() < 1e-5
-    assert error[fall > 0.02 * peak].max() < 1e-11
+    assert error[motor_slope > 0.02 * peak].max() < 1e-11

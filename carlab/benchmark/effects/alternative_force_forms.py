@@ -10,11 +10,11 @@ from carlab.benchmark.effects.force_forms import STICTION_MPS
 from carlab.benchmark.effects.tyre_forms import (
     driven_front,
     driven_wheels,
+    limit_over_grip,
     other_tyres,
     placed,
     saturating,
     slipping,
-    spinning,
     spinning_wheels,
 )
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
@@ -218,11 +218,6 @@ def force_limit(size: float, draw: Draw) -> dict[str, float]:
     return {"force": draw.car.drive_gain / max(size, 1e-6)}
 
 
-def friction_share(size: float, draw: Draw) -> dict[str, float]:
-    """A multiple of the share of the rear axle's friction that the largest drive force needs."""
-    return {"share": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(size, 1e-6)}
-
-
 def controller_forces(size: float, draw: Draw) -> dict[str, float]:
     """Multiples of the largest drive force [N]: forwards, and 0.6 to 1 of it backwards."""
     forward = draw.car.drive_gain / max(size, 1e-6)
@@ -236,7 +231,7 @@ def drag_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 FORMS = (
     Form("motor_saturation", "other", force_limit, soft_motor, 0.3, 3.0),
-    Form("traction_limit", "other", friction_share, soft_traction, 0.3, 3.0, fixed={"axle": "rear"}),
+    Form("traction_limit", "other", limit_over_grip("share"), soft_traction, 0.3, 3.0, fixed={"axle": "rear"}),
     Form("speed_controller", "other", controller_forces, soft_controller, 0.3, 3.0),
     Form("drag_brake", "other", plain("force"), shorted_motor, 0.3, 20.0),
     Form("battery_sag", "other", plain("rate"), charge_sag, 0.0004, 0.008),
@@ -247,7 +242,7 @@ FORMS = (
     Form("tyre_saturation", "other", saturating, other_tyres(brush_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("all_wheel_drive", "other", plain("share"), driven_front(slipping_clutch), 0.1, 1.0),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
-    Form("combined_slip", "other", spinning, spinning_wheels(brush_shape(1.0, 1.0)), 0.6, 3.0),
+    Form("combined_slip", "other", limit_over_grip("grip_ratio"), spinning_wheels(brush_shape(1.0, 1.0)), 0.6, 3.0),
     Form("longitudinal_slip", "other", slipping, driven_wheels(brush_shape(1.0, 1.0)), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),
     Form("load_transfer", "other", plain("height"), pitching, 0.02, 0.2),

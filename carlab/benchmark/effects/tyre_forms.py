@@ -96,38 +96,38 @@ def driven_wheels(curve: Callable[[float], float]) -> Attach:
 def spinning_wheels(shape: Callable[[float], float]) -> Attach:
     """Driven wheels without inertia whose tyres' force points along their slip.
 
-    ``shape`` goes from slope one at no slip to one at the limit. The rims are as fast as the motor needs for the tyres'
-    force; a limit of the motor that acts later slows them down.
+    ``shape`` goes from slope one at no slip to one at the limit. The wheels turn at the speed at which the forces of
+    motor and tyres are equal; a limit of the motor that acts later makes them slower.
     """
     hypot = math.hypot
 
     def attach(world: World, p: Parameters) -> None:
         car = world.car
         slope = car.b_rear * car.c_rear
-        at_rims = [0.0, 0.0]
+        at_wheels = [0.0, 0.0]
 
-        def balance(now: Instant, wanted: float, damping: float) -> tuple[float, float]:
+        def balance(now: Instant, motor_force: float, damping: float) -> tuple[float, float]:
             """Scaled slip along the car, and the tyres' force [N] where it equals the motor's."""
             per_speed = slope / max(abs(now.vx), SLIP_FLOOR_MPS)
             across = per_speed * (now.vy - car.rear_axle * now.r)
-            top, fall = p["grip_ratio"] * now.mu_r * now.fz_r, damping / per_speed
+            top, motor_slope = p["grip_ratio"] * now.mu_r * now.fz_r, damping / per_speed
 
             def force(along: float) -> float:
                 size = hypot(along, across)
                 return top * shape(size) * along / size
 
-            most = wanted * per_speed / car.damping
-            if most < 1e-9:
+            max_slip = motor_force * per_speed / car.damping
+            if max_slip < 1e-9:
                 return 0.0, 0.0
-            along = brentq(lambda k: fall * k + force(k) - wanted, 1e-12, most, xtol=1e-12)
+            along = brentq(lambda k: motor_slope * k + force(k) - motor_force, 1e-12, max_slip, xtol=1e-12)
             return along, force(along)
 
         def spin(now: Instant) -> None:
-            at_rims[:] = balance(now, abs(now.fx), car.damping)
-            now.fx = math.copysign(at_rims[1], now.fx)
+            at_wheels[:] = balance(now, abs(now.fx), car.damping)
+            now.fx = math.copysign(at_wheels[1], now.fx)
 
-        def share(now: Instant) -> None:
-            along, force = at_rims
+        def reduce_side_force(now: Instant) -> None:
+            along, force = at_wheels
             if abs(now.fx) < (1.0 - 1e-9) * force:
                 along, _ = balance(now, abs(now.fx), 0.0)
             across = slope * max(abs(now.vy - car.rear_axle * now.r), 1e-9) / max(abs(now.vx), SLIP_FLOOR_MPS)
@@ -135,7 +135,7 @@ def spinning_wheels(shape: Callable[[float], float]) -> Attach:
             now.fr *= shape(size) / size * across / shape(across)
 
         world.hooks["limit"].insert(0, spin)
-        world.hooks["tyre"].insert(0, share)
+        world.hooks["tyre"].insert(0, reduce_side_force)
 
     return attach
 
@@ -221,9 +221,9 @@ def slipping(size: float, draw: Draw) -> dict[str, float]:
     return {"inertia": 2e-4 * size, "stiffness": 40.0 / max(size, 1e-9)}
 
 
-def spinning(size: float, draw: Draw) -> dict[str, float]:
-    """Grip along over grip across, so that the limit is the largest drive force over the size."""
-    return {"grip_ratio": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(size, 1e-6)}
+def limit_over_grip(key: str) -> Callable[[float, Draw], dict[str, float]]:
+    """A limit over the grip of the rear axle; the limit is the largest drive force over the size."""
+    return lambda size, draw: {key: draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(size, 1e-6)}
 
 
 def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
@@ -235,7 +235,9 @@ FORMS = (
     Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda fx, share, car: share * fx), 0.1, 1.0),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
-    Form("combined_slip", "catalogue", spinning, spinning_wheels(pacejka_shape(1.0, 1.0)), 0.6, 3.0),
+    Form(
+        "combined_slip", "catalogue", limit_over_grip("grip_ratio"), spinning_wheels(pacejka_shape(1.0, 1.0)), 0.6, 3.0
+    ),
     Form("longitudinal_slip", "catalogue", slipping, driven_wheels(math.tanh), 1.0, 8.0, smallest=0.5),
     Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),
     Form("load_transfer", "catalogue", plain("height"), load_transfer, 0.02, 0.2),

@@ -43,7 +43,7 @@ class PairwiseResult:
 def choose_confusable(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> tuple[Model, PairwiseResult]:
-    """Replace effects of a model by confusable effects that predict left-out blocks better.
+    """Replace effects of a model by confusable effects with a lower loss on left-out blocks.
 
     A replaced effect does not return: each comparison fits the alternative once more than the model, so two effects
     that fit equally well would replace one another again and again.
