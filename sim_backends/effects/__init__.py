@@ -4,8 +4,8 @@ To add your own effect, write its class and call ``sim_backends.registry.registe
 list it here.
 
 Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity, offset) and
-throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake asymmetry,
-drag brake, saturation) -> driven axle (combined slip, speed controller, traction limit, wheel slip) -> body
+throttle (dead band, nonlinearity, asymmetry, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
+asymmetry, drag brake, saturation) -> driven axle (combined slip, speed controller, traction limit, wheel slip) -> body
 (resistances, slope, bias, moments) -> load transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is
 measured (marker offset, yaw misalignment, velocity filter, latency). Within a group: by ``order``, then by id.
 """
@@ -51,7 +51,7 @@ from sim_backends.effects.steering import (
     SteeringOffset,
     SteeringRateLimit,
 )
-from sim_backends.effects.throttle import ThrottleDeadband, ThrottleNonlinearity
+from sim_backends.effects.throttle import ThrottleAsymmetry, ThrottleDeadband, ThrottleNonlinearity
 from sim_backends.effects.tyres import (
     FrictionDrift,
     FrictionEllipse,
@@ -75,6 +75,7 @@ _ALL: tuple[Effect, ...] = (
     SteeringNonlinearity(),
     ThrottleDeadband(),
     ThrottleNonlinearity(),
+    ThrottleAsymmetry(),
     MotorLag(),
     MotorSaturation(),
     TractionLimit(),

@@ -1,6 +1,6 @@
 """Effects between the throttle command and the motor (speed controller), except lag and delay.
 
-Acting order: dead band, nonlinearity, lag. Throttle in [-1, 1].
+Acting order: dead band, nonlinearity, asymmetry, lag. Throttle in [-1, 1].
 """
 
 from __future__ import annotations
@@ -89,3 +89,28 @@ class ThrottleNonlinearity(ActuatorEffect):
         cubic = ops.clip(0.5 * (values["exponent"] - 1.0), *_CUBIC_SHARES)
         expo = command + cubic * command * (size * size - 1.0)
         return ops.where(values["curve"] < 0.5, ops.where(large, ops.sign(command) * power, command), expo)
+
+
+class ThrottleAsymmetry(ActuatorEffect):
+    """``u = gain_ratio u_t`` for a negative throttle ``u_t``; motor controllers have such a setting for reverse."""
+
+    id = "throttle_asymmetry"
+    represented_by = "drive_map"
+    name = "a gain in reverse that differs from the forward gain"
+    summary = "The motor's gain differs between forward and reverse throttle."
+    sentence = "in reverse, the motor has {gain_ratio} times the force that it has forwards at the same throttle"
+    refuted_if = "the car is as fast backwards as forwards at the same throttle"
+    command = "throttle"
+    order = 30
+    parameters = (EffectParameter("gain_ratio", "1", 1.0, 0.0, 10.0, 1.5),)
+    confusable = (
+        Confusable(
+            "brake_asymmetry",
+            "throttle_steps",
+            "a weak reverse drives the car slowly backwards too; a weak brake only brakes less",
+        ),
+    )
+
+    def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
+        """Scale a negative throttle."""
+        return ops.where(command < 0.0, values["gain_ratio"] * command, command)

@@ -39,6 +39,11 @@ TRUTHS = {
         lambda u, v: np.minimum(np.maximum(14.0 * u, -4.0), 6.0) - 0.5 * v,
         {"gain": 14.0, "braking limit": 4.0, "driving limit": 6.0, "damping": 0.5},
     ),
+    "throttle_asymmetry": (
+        "drive_map",
+        lambda u, v: np.maximum(u, 0.0) * 12.0 + np.minimum(u, 0.0) * 7.0 - 1.2 * v,
+        {"forward gain": 12.0, "gain in reverse": 7.0, "damping": 1.2},
+    ),
     "drag_brake": (
         "drive_map",
         lambda u, v: (

@@ -31,6 +31,7 @@ IDS = [
     "steering_nonlinearity",
     "throttle_deadband",
     "throttle_nonlinearity",
+    "throttle_asymmetry",
     "motor_lag",
     "motor_saturation",
     "traction_limit",

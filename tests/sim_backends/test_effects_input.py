@@ -97,6 +97,8 @@ def test_static_throttle_effects_have_their_closed_forms():
         size = abs(u)
         expected = np.sign(u) * max(size - 0.1, 0) / 0.9
         assert throttle({"throttle_deadband": {"width": 0.1}}, u) == pytest.approx(expected)
+        expected = u if u > 0 else 0.6 * u
+        assert throttle({"throttle_asymmetry": {"gain_ratio": 0.6}}, u) == pytest.approx(expected)
         for exponent in (0.5, 1.3, 2.0):
             found = throttle({"throttle_nonlinearity": {"exponent": exponent}}, u)
             assert found == pytest.approx(np.sign(u) * size**exponent)

@@ -24,7 +24,8 @@ MIN_SCORE_FALL = 0.03
 MAX_TERMS = 8
 # Effects whose parameter may have either sign; other effects need a positive coefficient.
 EITHER_SIGN = frozenset({
-    "command_delay", "steering_offset", "steering_asymmetry", "throttle_nonlinearity", "brake_asymmetry", "battery_sag",
+    "command_delay", "steering_offset", "steering_asymmetry", "throttle_nonlinearity", "throttle_asymmetry",
+    "brake_asymmetry", "battery_sag",
     "friction_drift", "torque_steer", "lateral_bias", "road_slope", "marker_offset", "mocap_yaw_misalignment",
 })  # fmt: skip
 

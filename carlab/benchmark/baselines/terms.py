@@ -28,7 +28,7 @@ AT_END_ONLY = ("velocity_filter_lag",)
 _SIZES = {
     "command_delay": 0.02, "steering_delay": 0.02, "throttle_delay": 0.02, "steering_lag": 0.04, "motor_lag": 0.05,
     "steering_deadband": 0.03, "steering_offset": 0.02, "steering_asymmetry": 0.05, "throttle_deadband": 0.03,
-    "throttle_nonlinearity": 1.1,
+    "throttle_nonlinearity": 1.1, "throttle_asymmetry": 1.1,
 }  # fmt: skip
 
 
@@ -40,6 +40,7 @@ def library(data: Prepared) -> dict[str, Term]:
     terms |= {
         "rolling_resistance": _force(lambda s, v: (-np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
         "aerodynamic_drag": _force(lambda s, v: (-v[:, 3] * np.abs(v[:, 3]), 0.0, 0.0)),
+        "brake_asymmetry": _force(lambda s, v: (_further_braking(s, v), 0.0, 0.0)),
         "drag_brake": _force(lambda s, v: (-_released(s) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
         "speed_controller": _force(lambda s, v: (_lost_force(s, v), 0.0, 0.0)),
         "cornering_drag": _force(lambda s, v: (-np.abs(_angle(s)) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
@@ -139,6 +140,12 @@ def _angle(s: Steps) -> FloatArray:
 
 def _throttle(s: Steps) -> FloatArray:
     return np.asarray(s.commands()[:, :, 1].mean(axis=1))
+
+
+def _further_braking(s: Steps, middle: FloatArray) -> FloatArray:
+    """A tenth of the motor's force where it opposes the motion [N]."""
+    throttle = _throttle(s)
+    return np.where(throttle * middle[:, 3] < 0.0, 0.1 * s.car.drive_gain * throttle, 0.0)
 
 
 def _released(s: Steps) -> FloatArray:
@@ -272,5 +279,4 @@ def _other_commands(data: Prepared) -> dict[str, CommandChange]:
         "steering_backlash": with_play,
         "steering_nonlinearity": mapped(0, lambda u: 1.5 * np.tanh(u / 1.5)),
         "motor_saturation": mapped(1, lambda u: np.clip(u, -ceiling, ceiling)),
-        "brake_asymmetry": mapped(1, lambda u: np.where(u < 0.0, 1.1 * u, u)),
     }

@@ -83,6 +83,7 @@ COMMAND_EFFECTS: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tupl
         (0.0, 0.3),
     ),
     "throttle_nonlinearity": (lambda v, car: mapped(1, lambda u: np.sign(u) * np.abs(u) ** v), (0.4, 2.5)),
+    "throttle_asymmetry": (lambda v, car: mapped(1, lambda u: np.where(u < 0.0, v * u, u)), (0.2, 4.0)),
 }
 
 

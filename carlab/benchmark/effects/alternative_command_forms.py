@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, inverse, plain
+from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, factor, inverse, plain
 from carlab.benchmark.world.physics import Instant, World
 
 
@@ -133,6 +133,12 @@ def throttle_curve(world: World, p: Parameters) -> None:
     world.throttle_maps.append(lambda u: math.copysign(math.expm1(bend * abs(u)) / math.expm1(bend), u))
 
 
+def soft_throttle_asymmetry(world: World, p: Parameters) -> None:
+    """A gain that changes gradually between forward and reverse, over a tenth of full throttle."""
+    change = p["gain_ratio"] - 1.0
+    world.throttle_maps.append(lambda u: u * (1.0 + 0.5 * change * (1.0 - math.tanh(u / 0.1))))
+
+
 def seeded(key: str) -> Callable[[float, Draw], dict[str, float]]:
     """The size, and a seed for jitter."""
     return lambda size, draw: {key: size, "seed": math.floor(1e6 * draw.shares[0])}
@@ -154,5 +160,6 @@ FORMS = (
     Form("steering_nonlinearity", "other", inverse("saturation"), linkage, 0.7, 2.2),
     Form("throttle_deadband", "other", plain("width"), soft_throttle_deadband, 0.01, 0.4),
     Form("throttle_nonlinearity", "other", plain("bend"), throttle_curve, 0.2, 4.0),
+    Form("throttle_asymmetry", "other", factor("gain_ratio"), soft_throttle_asymmetry, 0.1, 1.5),
     Form("motor_lag", "other", plain("time_constant"), two_lags, 0.03, 1.0),
 )

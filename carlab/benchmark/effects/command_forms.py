@@ -116,6 +116,12 @@ def throttle_nonlinearity(world: World, p: Parameters) -> None:
     world.throttle_maps.append(lambda u: math.copysign(abs(u) ** exponent, u))
 
 
+def throttle_asymmetry(world: World, p: Parameters) -> None:
+    """A reverse with another gain."""
+    ratio = p["gain_ratio"]
+    world.throttle_maps.append(lambda u: u if u > 0.0 else ratio * u)
+
+
 def extra_delay(size: float, draw: Draw) -> dict[str, float]:
     """An additional delay [s] of either sign that leaves a twentieth of the delay of the car file."""
     return {"extra_delay": max(draw.sign * size, -0.95 * draw.car.command_delay)}
@@ -135,4 +141,5 @@ FORMS = (
     Form("steering_nonlinearity", "catalogue", inverse("saturation"), steering_nonlinearity, 0.7, 8.0),
     Form("throttle_deadband", "catalogue", plain("width"), throttle_deadband, 0.01, 0.4),
     Form("throttle_nonlinearity", "catalogue", factor("exponent"), throttle_nonlinearity, 0.05, 1.2),
+    Form("throttle_asymmetry", "catalogue", factor("gain_ratio"), throttle_asymmetry, 0.1, 1.5),
 )

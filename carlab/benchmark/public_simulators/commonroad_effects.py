@@ -46,6 +46,7 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "steering_nonlinearity": (Physics("similar", "the angle is linear; the front tyre's Magic Formula saturates"),),
     "throttle_deadband": (Physics("no", "the requested acceleration is proportional to the throttle"),),
     "throttle_nonlinearity": (Physics("similar", "the request is proportional; the tyre's force over slip is not"),),
+    "throttle_asymmetry": (Physics("similar", "the request is symmetric; brake torque goes to the front wheels too"),),
     "motor_lag": (Physics("similar", "no motor state; force follows torque through wheel inertia and slip"),),
     "motor_saturation": (Physics("similar", "commands stay below a_max = 11.5 m/s2; the rear tyres limit the force"),),
     "traction_limit": (Physics("yes", "F_x saturates at p_dx1 F_z of the driven rear wheels (tire_model.py)"),),

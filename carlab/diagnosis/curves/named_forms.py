@@ -24,7 +24,7 @@ from sim_backends.effects.drive import (
     limited_by_direction,
 )
 from sim_backends.effects.steering import SteeringAsymmetry, SteeringDeadband, SteeringNonlinearity
-from sim_backends.effects.throttle import ThrottleDeadband, ThrottleNonlinearity
+from sim_backends.effects.throttle import ThrottleAsymmetry, ThrottleDeadband, ThrottleNonlinearity
 
 SLOW_MPS = 0.1
 """Speed below which dry friction falls to 0, so that a form is continuous."""
@@ -124,6 +124,10 @@ DRIVE_FORMS = (
          lambda gain, width, damping, u, v: gain * dead_band(u, width) - damping * v),
     Form(ThrottleNonlinearity.id, "an exponent of the throttle", (_GAIN, _EXPONENT, _DAMPING),
          lambda gain, exponent, damping, u, v: gain * power(u, exponent) - damping * v),
+    Form(ThrottleAsymmetry.id, ThrottleAsymmetry.name,
+         (FormParameter("forward gain", "m/s2", (4.0, 15.0)), FormParameter("gain in reverse", "m/s2", (4.0, 15.0)),
+          _DAMPING),
+         lambda forward, reverse, damping, u, v: _two_slopes(reverse, forward, u) - damping * v),
     Form(MotorSaturation.id, "a limit of the motor's force", (_GAIN, _BRAKE, _DRIVE, _DAMPING), _saturated_drive),
     Form(DragBrake.id, DragBrake.name,
          (_GAIN, _DAMPING, _WIDTH, FormParameter("brake", "m/s2", (2.0,))), _drag_brake),
