@@ -1,4 +1,4 @@
-"""Test that a diagnosis names a speed controller and a drag brake that an independent generator conceals."""
+"""Test that a diagnosis names settings of a motor controller that an independent generator conceals."""
 
 from pathlib import Path
 
@@ -23,10 +23,13 @@ CANDIDATES = (
     "drag_brake",
     "rolling_resistance",
     "throttle_deadband",
+    "throttle_asymmetry",
+    "brake_asymmetry",
 )
 CONCEALED = {
     "speed_controller": {"forward_force": 0.5 * CAR.drive_gain, "backward_force": 0.3 * CAR.drive_gain},
     "drag_brake": {"force": 0.3 * CAR.drive_gain},
+    "throttle_asymmetry": {"gain_ratio": 0.6},
 }
 
 

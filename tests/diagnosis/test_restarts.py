@@ -11,7 +11,7 @@ from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.selection import forward, restarts
 from carlab.diagnosis.selection.forward import Path, extend
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.restarts import restart
+from carlab.diagnosis.selection.restarts import needs_restart, restart
 from carlab.diagnosis.settings import RESTARTS
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
@@ -52,7 +52,8 @@ def test_restart_finds_the_lower_minimum(problem: SearchProblem, stuck: Model) -
 
 def test_model_that_reaches_the_noise_is_not_restarted(problem: SearchProblem, stuck: Model) -> None:
     accurate = replace(stuck, scale=Scale(np.array([8, 16, 24]), np.tile(problem.floor, (3, 1))))
-    assert restart(problem, accurate, RunControl()) is accurate
+    assert needs_restart(problem, stuck)
+    assert not needs_restart(problem, accurate)
 
 
 def test_stopped_search_is_not_restarted(problem: SearchProblem, stuck: Model) -> None:
@@ -63,7 +64,7 @@ def test_model_with_few_effects_is_not_restarted(
     problem: SearchProblem, stuck: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(restarts, "RESTARTS", replace(RESTARTS, min_effects=2))
-    assert restart(problem, stuck, RunControl()) is stuck
+    assert not needs_restart(problem, stuck)
 
 
 def test_path_continues_with_the_restarted_model(
@@ -77,6 +78,7 @@ def test_path_continues_with_the_restarted_model(
         return restarted[-1]
 
     monkeypatch.setattr(forward, "restart", other)
+    monkeypatch.setattr(forward, "needs_restart", lambda problem, model: True)
     monkeypatch.setattr(
         forward, "next_candidates", lambda problem, model, control: (Candidate(ELLIPSE, stuck.fit, 1.0),)
     )
@@ -87,3 +89,30 @@ def test_path_continues_with_the_restarted_model(
     assert len(restarted) == 1
     assert path.model is restarted[0]
     assert path.history == ((ELLIPSE, restarted[0].fit),)
+
+
+@pytest.mark.parametrize(("found_lower", "expected"), [(False, 2), (True, 4)])
+def test_path_is_restarted_until_two_successive_restarts_find_nothing(
+    problem: SearchProblem, stuck: Model, monkeypatch: pytest.MonkeyPatch, found_lower: bool, expected: int
+) -> None:
+    """Four effects are accepted; the second restart finds a lower cost or not."""
+    restarted: list[Model] = []
+
+    def other(problem: SearchProblem, model: Model, control: RunControl) -> Model:
+        restarted.append(model)
+        return replace(model) if found_lower and len(restarted) == 2 else model
+
+    def fitted(problem: SearchProblem, effects: tuple[str, ...], *start: object) -> Model:
+        return replace(stuck, effects=effects)
+
+    monkeypatch.setattr(forward, "restart", other)
+    monkeypatch.setattr(forward, "fit_with_scale", fitted)
+    monkeypatch.setattr(forward, "apply_moves", lambda problem, model, control: model)
+    names = iter(("a", "b", "c", "d"))
+    monkeypatch.setattr(
+        forward, "next_candidates", lambda *_: tuple(Candidate(name, stuck.fit, 1.0) for name in (next(names, ""),))
+    )
+    monkeypatch.setattr(forward, "accepted", lambda _, __, candidates, ___: candidates if candidates[0].effect else ())
+    path = extend(problem, Path(replace(stuck, effects=())), RunControl())
+    assert path.model.effects == ("a", "b", "c", "d")
+    assert len(restarted) == expected

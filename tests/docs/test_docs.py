@@ -25,6 +25,7 @@ from carlab.experiment.episodes.result import EpisodeResult
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from mocap.config import MocapConfig
+from sim_backends.effects import CATALOGUE
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -224,6 +225,11 @@ def test_links_between_files_of_the_repository_resolve() -> None:
         if not (page.parent / target).exists()
     ]
     assert broken == []
+
+
+def test_each_effect_of_the_catalogue_has_a_picture() -> None:
+    drawn = {path.stem for path in (ROOT / "docs" / "images" / "effects").glob("*.png")}
+    assert drawn == set(CATALOGUE), "run make pictures"
 
 
 def test_site_builds_without_warnings(tmp_path: Path) -> None:

@@ -20,7 +20,8 @@ from carlab.diagnosis.selection.candidates import accepted, next_candidates
 from carlab.diagnosis.selection.moves import apply_moves
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_with_scale
-from carlab.diagnosis.selection.restarts import restart
+from carlab.diagnosis.selection.restarts import needs_restart, restart
+from carlab.diagnosis.settings import RESTARTS
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +46,7 @@ class Path:
     first_candidates  candidates for the first effect of this path
     alternatives      further accepted candidates of each step, not confusable with the one that was added
     visited           sets of effects after each step
+    failed_restarts     number of successive restarts without a lower cost
     """
 
     model: Model
@@ -52,6 +54,7 @@ class Path:
     first_candidates: tuple[Candidate, ...] = ()
     alternatives: tuple[Choice, ...] = ()
     visited: frozenset[frozenset[str]] = frozenset()
+    failed_restarts: int = 0
 
 
 def extend(
@@ -128,7 +131,8 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     leader, before = chosen[0], path.model
     log.info("accepted %s", leader.effect)
     added = fit_with_scale(problem, (*before.effects, leader.effect), leader.fit.config, leader.fit.free, leader.fit.z)
-    model = apply_moves(problem, restart(problem, added, control), control)
+    restarted, failed_restarts = _restarted(problem, added, path.failed_restarts, control)
+    model = apply_moves(problem, restarted, control)
     confusable = problem.confusable.get(leader.effect, ())
     others = tuple(Choice(path, c) for c in chosen[1:] if c.effect not in confusable)
     return Path(
@@ -137,7 +141,16 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
         path.first_candidates,
         (*path.alternatives, *others),
         path.visited | {frozenset(model.effects)},
+        failed_restarts,
     )
+
+
+def _restarted(problem: SearchProblem, model: Model, failed: int, control: RunControl) -> tuple[Model, int]:
+    """The model from perturbed parameters, and the number of its path's successive restarts without a lower cost."""
+    if failed >= RESTARTS.max_failed or not needs_restart(problem, model):
+        return model, failed
+    restarted = restart(problem, model, control)
+    return restarted, failed + 1 if restarted is model else 0
 
 
 def _effects(path: Path) -> frozenset[str]:

@@ -20,14 +20,15 @@ from carlab.diagnosis.settings import RESTARTS
 log = logging.getLogger(__name__)
 
 
-def restart(problem: SearchProblem, model: Model, control: RunControl) -> Model:
-    """The model, or one with the same effects and a lower cost, from perturbed parameters.
-
-    A model that reaches the noise, or with few effects, is not restarted.
-    """
+def needs_restart(problem: SearchProblem, model: Model) -> bool:
+    """Whether a model has several effects and does not reach the noise."""
     excess = float(np.mean((model.scale.sigma / problem.floor) ** 2)) - 1.0
-    is_accurate = excess < RESTARTS.min_model_error
-    if is_accurate or len(model.effects) < RESTARTS.min_effects or control.ends_search():
+    return excess >= RESTARTS.min_model_error and len(model.effects) >= RESTARTS.min_effects
+
+
+def restart(problem: SearchProblem, model: Model, control: RunControl) -> Model:
+    """The model, or one with the same effects and a lower cost, from perturbed parameters."""
+    if control.ends_search():
         return model
     config, free = problem.config_with(model.effects), model.fit.free
     fit = partial(problem.fitter(model.scale).fit, iterations=RESTARTS.iterations)

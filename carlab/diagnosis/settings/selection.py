@@ -154,6 +154,9 @@ class RestartSettings:
     """Number of iterations after which the costs are compared; 20 give the same minimum."""
     min_effects: int = 4
     """Number of effects from which a model is restarted; on train_1 fits with fewer ended at one minimum."""
+    max_failed: int = 2
+    """Number of successive restarts without a lower cost after which a path is restarted no more; each takes about a
+    quarter of the time of a step."""
     min_fall_share: float = 0.01
     """Minimum relative fall of the cost; smaller ones are differences between fits that end near one minimum."""
     min_model_error: float = 1.0
