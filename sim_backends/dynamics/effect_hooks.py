@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.base import DynamicsEffect, Forces, ModelKind, Parameters, StepStart, StiffStep
 
-HOOKS = ("on_load", "on_grip", "on_drive", "on_traction", "on_body", "on_transfer", "on_tyre", "on_motion")
+HOOKS = (
+    "front_slip", "on_load", "on_grip", "on_drive", "on_traction", "on_body", "on_transfer", "on_tyre", "on_motion",
+)  # fmt: skip
 _N_ITERATIONS = 2
 """Iterations of load transfer and limits of the driven axle if both are present."""
 
 
 class _Bound(NamedTuple):
     effect: DynamicsEffect
-    hook: Callable[..., None]
+    hook: Callable[..., Any]
     values: Parameters
 
 
@@ -55,6 +57,12 @@ class EffectHooks:
     def stiff_steps(self, start: StepStart) -> dict[str, StiffStep]:
         """A step of each effect with stiff states, by effect id."""
         return {e.id: e.stiff_step(self._ops, start, self.values[e.id]) for e in self._effects if e.stiff}
+
+    def front_slip(self, slip_rad: Value) -> Value:
+        """Slip angle of the front tyres [rad] from that of wheels at the angle of the servo."""
+        for _, hook, values in self._by_hook["front_slip"]:
+            slip_rad = hook(self._ops, slip_rad, values)
+        return slip_rad
 
     def run(self, name: str, forces: Forces) -> None:
         """Call one hook of every effect that overrides it."""

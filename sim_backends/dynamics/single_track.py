@@ -190,7 +190,7 @@ class SingleTrack:
         rear = ops.fms(self.rear_axle, r, vy)
         along = ops.fma(front, sin_d, vx * cos_d)
         across = ops.fms(vx, sin_d, front * cos_d)
-        front_slip = ops.slope_angle(across, ops.at_least(ops.abs(along), SLIP_FLOOR_MPS))
+        front_slip = self.hooks.front_slip(ops.slope_angle(across, ops.at_least(ops.abs(along), SLIP_FLOOR_MPS)))
         rear_slip = ops.slope_angle(rear, ops.at_least(ops.abs(vx), SLIP_FLOOR_MPS))
         if self.kind == "linear_tyre":
             return self.front_stiffness * front_slip, self.rear_stiffness * rear_slip

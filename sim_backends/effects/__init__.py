@@ -55,6 +55,7 @@ from sim_backends.effects.throttle import ThrottleAsymmetry, ThrottleDeadband, T
 from sim_backends.effects.tyres import (
     FrictionDrift,
     FrictionEllipse,
+    FrontWheelPlay,
     LowFrictionPatch,
     TyreRelaxation,
     TyreSaturation,
@@ -88,6 +89,7 @@ _ALL: tuple[Effect, ...] = (
     AerodynamicDrag(),
     CorneringDrag(),
     TyreSaturation(),
+    FrontWheelPlay(),
     FrictionEllipse(),
     CombinedSlip(),
     LongitudinalSlip(),

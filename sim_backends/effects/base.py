@@ -293,11 +293,12 @@ class StiffStep(Protocol):
 class DynamicsEffect(Effect):
     """Changes the forces. Override the hooks that are needed; the others cost nothing.
 
-    The hooks run in this order: ``on_load`` (axle loads), ``on_grip`` (friction coefficients), ``on_drive`` (the
-    motor's force), ``on_traction`` (F_x of the driven axle, after damping), ``on_body`` (``force_x``, ``force_y`` and
-    ``moment`` at the centre of mass), ``on_transfer`` (loads that depend on the acceleration), ``on_tyre`` (side forces
-    of both axles, after the tyre model), ``on_motion`` (rates of states that depend on the acceleration). Where load
-    transfer and a limit of the driven axle depend on one another, ``on_traction`` and ``on_transfer`` are repeated.
+    The hooks run in this order: ``front_slip`` (slip angle of the front wheels), ``on_load`` (axle loads), ``on_grip``
+    (friction coefficients), ``on_drive`` (the motor's force), ``on_traction`` (F_x of the driven axle, after damping),
+    ``on_body`` (``force_x``, ``force_y`` and ``moment`` at the centre of mass), ``on_transfer`` (loads that depend on
+    the acceleration), ``on_tyre`` (side forces of both axles, after the tyre model), ``on_motion`` (rates of states
+    that depend on the acceleration). Where load transfer and a limit of the driven axle depend on one another,
+    ``on_traction`` and ``on_transfer`` are repeated.
     """
 
     kind: ClassVar[Kind] = "dynamics"
@@ -318,6 +319,10 @@ class DynamicsEffect(Effect):
     def stiff_step(self, ops: Ops, start: StepStart, values: Parameters) -> StiffStep:
         """Begin a step of the stiff states."""
         raise NotImplementedError
+
+    def front_slip(self, ops: Ops, slip_rad: Value, values: Parameters) -> Value:
+        """Slip angle of the front tyres [rad] from that of wheels at the angle of the servo, positive left."""
+        return slip_rad
 
     def on_load(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Change ``load_front`` and ``load_rear``."""

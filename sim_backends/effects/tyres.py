@@ -85,6 +85,40 @@ class TyreSaturation(DynamicsEffect):
         )
 
 
+class FrontWheelPlay(DynamicsEffect):
+    """``a_f - clip(a_f, -angle, angle)`` in place of the slip angle a_f of the front wheels.
+
+    The side force turns the wheels within the play of their linkage, until they reach its end. The play operator of
+    ``steering_backlash`` acts between servo and wheels instead, and its wheels keep their angle against the side force.
+    """
+
+    id = "front_wheel_play"
+    represented_by = "front_tyre_map"
+    name = "play of the front wheels"
+    summary = "The side force turns the front wheels within the play of their linkage."
+    sentence = "the side force turns the front wheels by {angle} against the steering, within the play of their linkage"
+    refuted_if = "the front wheels of the parked car cannot be turned by hand while the servo holds its angle"
+    command = "steering"
+    base_models = ("dynamic", "linear_tyre", "blend")
+    parameters = (EffectParameter("angle", "rad", 0.0, 0.0, 0.3, 0.03),)
+    confusable = (
+        Confusable(
+            "steering_deadband",
+            "steering_chirp",
+            "a dead band follows the sign of the command, play that of the side force; they differ in fast weaving",
+        ),
+        Confusable(
+            "steering_backlash",
+            "steering_chirp",
+            "backlash waits after each reversal of the command, play after each reversal of the side force",
+        ),
+    )
+
+    def front_slip(self, ops: Ops, slip_rad: Value, values: Parameters) -> Value:
+        """Nothing within the play."""
+        return ops.sign(slip_rad) * ops.at_least(ops.abs(slip_rad) - values["angle"], 0.0)
+
+
 class FrictionDrift(DynamicsEffect):
     """``mu (1 + rate t)`` of both axles, t since the first row of the recording; not below zero."""
 

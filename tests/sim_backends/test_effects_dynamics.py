@@ -43,6 +43,8 @@ CASES = {
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
     "all_wheel_drive_with_ellipse": {"all_wheel_drive": {"share": 0.6}, "friction_ellipse": {"scale": 0.7}},
     "all_wheel_drive_with_transfer": {"all_wheel_drive": {"share": 0.5}, "load_transfer": {"height": 0.06}},
+    "play": {"front_wheel_play": {"angle": 0.06}},
+    "play_with_transfer": {"front_wheel_play": {"angle": 0.04}, "load_transfer": {"height": 0.06}},
     "spinning_wheels": {"combined_slip": {"grip_ratio": 0.5}},
     "spinning_wheels_with_transfer": {"combined_slip": {"grip_ratio": 0.6}, "load_transfer": {"height": 0.06}},
     "spinning_wheels_of_a_limited_motor": {
@@ -221,6 +223,8 @@ def reference_rates(t, s, d, u, p, e):
 
     side = vy + a * r
     slip_front = math.atan2(side * math.cos(d) - vx * math.sin(d), max(abs(vx * math.cos(d) + side * math.sin(d)), 0.3))
+    if has("front_wheel_play"):
+        slip_front -= np.clip(slip_front, -e["front_wheel_play"]["angle"], e["front_wheel_play"]["angle"])
     slip_rear = math.atan2(vy - b * r, max(abs(vx), 0.3))
     front_each = -mu_front * math.sin(p.front_c * math.atan(p.front_b * slip_front))
     rear_each = -mu_rear * math.sin(p.rear_c * math.atan(p.rear_b * slip_rear))

@@ -44,6 +44,7 @@ IDS = [
     "aerodynamic_drag",
     "cornering_drag",
     "tyre_saturation",
+    "front_wheel_play",
     "friction_ellipse",
     "combined_slip",
     "longitudinal_slip",

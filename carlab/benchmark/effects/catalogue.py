@@ -41,6 +41,7 @@ CONFUSABLE: dict[str, tuple[str, ...]] = {
     "aerodynamic_drag": ("motor_saturation",),
     "cornering_drag": (),
     "tyre_saturation": ("steering_nonlinearity",),
+    "front_wheel_play": ("steering_deadband", "steering_backlash"),
     "friction_ellipse": ("load_transfer",),
     "combined_slip": ("friction_ellipse", "traction_limit", "speed_controller", "longitudinal_slip"),
     "longitudinal_slip": ("motor_lag", "traction_limit"),

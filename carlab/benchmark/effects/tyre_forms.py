@@ -42,6 +42,23 @@ def other_tyres(shape: Callable[[float, float], Callable[[float], float]]) -> At
     return attach
 
 
+def loose_wheels(tyre_slip: Callable[[float, float], float]) -> Attach:
+    """Front wheels with play: ``tyre_slip`` gives the slip angle of the tyres from that of the servo and the play."""
+
+    def attach(world: World, p: Parameters) -> None:
+        def turn(now: Instant) -> None:
+            now.shape_f = world.shape_front(tyre_slip(now.alpha_f, p["angle"]))
+
+        world.hooks["load"].insert(0, turn)
+
+    return attach
+
+
+def beyond_play(slip: float, play: float) -> float:
+    """Nothing within the play; it is subtracted beyond."""
+    return math.copysign(max(abs(slip) - play, 0.0), slip)
+
+
 def driven_front(front_force: Callable[[float, float, BaseCar], float]) -> Attach:
     """A part of F_x acts at the front wheels, along them; ``front_force`` gives it from F_x, the share and the car."""
 
@@ -233,6 +250,7 @@ def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 FORMS = (
     Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("front_wheel_play", "catalogue", plain("angle"), loose_wheels(beyond_play), 0.01, 0.2),
     Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda fx, share, car: share * fx), 0.1, 1.0),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
     Form(

@@ -59,6 +59,7 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "aerodynamic_drag": (_NO_DRAG,),
     "cornering_drag": (Physics("similar", "slip (r_bx1, combined slip), camber and load transfer lower F_x"),),
     "tyre_saturation": (Physics("yes", "Magic Formula; the nominal car file has one already"),),
+    "front_wheel_play": (Physics("no", "the front tyres' slip follows from the steering angle without play"),),
     "friction_ellipse": (Physics("yes", "combined slip: formula_lateral_comb, formula_longitudinal_comb"),),
     "combined_slip": (Physics("similar", "combined slip of spinning wheels, but their speed is a state"),),
     "longitudinal_slip": (Physics("yes", "wheel-speed states, I_y_w d omega/dt = T - R_w F_x(slip)"),),
