@@ -1,4 +1,4 @@
-"""Test that a diagnosis names settings of a motor controller that an independent generator conceals."""
+"""Test that a diagnosis names settings of a motor controller, and play, that an independent generator conceals."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tests.helpers.case_files import car_in
 
 pytestmark = pytest.mark.timeout(900)
 CAR = BaseCar()
-CANDIDATES = (
+MOTOR_EFFECTS = (
     "motor_saturation",
     "traction_limit",
     "speed_controller",
@@ -26,10 +26,19 @@ CANDIDATES = (
     "throttle_asymmetry",
     "brake_asymmetry",
 )
+STEERING_EFFECTS = (
+    "steering_deadband",
+    "steering_backlash",
+    "steering_lag",
+    "steering_nonlinearity",
+    "tyre_relaxation",
+    "front_wheel_play",
+)
 CONCEALED = {
     "speed_controller": {"forward_force": 0.5 * CAR.drive_gain, "backward_force": 0.3 * CAR.drive_gain},
     "drag_brake": {"force": 0.3 * CAR.drive_gain},
     "throttle_asymmetry": {"gain_ratio": 0.6},
+    "front_wheel_play": {"angle": 0.03},
 }
 
 
@@ -49,10 +58,10 @@ def recorded(effect: str, seed: int, duration_s: float) -> EpisodeData:
 
 
 @pytest.mark.parametrize("effect", CONCEALED)
-def test_concealed_effect_of_the_motor_controller_is_named_with_its_numbers(effect: str, tmp_path: Path) -> None:
+def test_concealed_effect_is_named_with_its_numbers(effect: str, tmp_path: Path) -> None:
     CAR.write(tmp_path / "car.toml")
     fit, held_out = recorded(effect, 1, 30.0), recorded(effect, 2, 12.0)
-    found = diagnose([fit], [held_out], car_in(tmp_path), effects=CANDIDATES).diagnosis
+    found = diagnose([fit], [held_out], car_in(tmp_path), effects=MOTOR_EFFECTS + STEERING_EFFECTS).diagnosis
     assert [e.id for e in found.effects] == [effect]
     for name, value in CONCEALED[effect].items():
         assert found.effects[0].parameters[name].value == pytest.approx(value, rel=0.1), name
