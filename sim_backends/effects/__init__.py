@@ -4,10 +4,11 @@ To add your own effect, write its class and call ``sim_backends.registry.registe
 list it here.
 
 Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity, offset) and
-throttle (dead band, nonlinearity, asymmetry, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
-asymmetry, drag brake, saturation) -> driven axle (combined slip, speed controller, traction limit, wheel slip) -> body
-(resistances, slope, bias, moments) -> load transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is
-measured (marker offset, yaw misalignment, velocity filter, latency). Within a group: by ``order``, then by id.
+throttle (dead band, nonlinearity, asymmetry, lag) -> front slip angle (play) -> loads (downforce) -> friction (drift,
+patch) -> drive (sag, brake asymmetry, drag brake, saturation) -> driven axle (combined slip, speed controller,
+traction limit, wheel slip) -> body (resistances, slope, bias, moments) -> load transfer -> side forces (ellipse, roll,
+relaxation) -> motion -> what is measured (marker offset, yaw misalignment, velocity filter, latency). Within a group:
+by ``order``, then by id.
 """
 
 from __future__ import annotations

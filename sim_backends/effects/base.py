@@ -321,7 +321,10 @@ class DynamicsEffect(Effect):
         raise NotImplementedError
 
     def front_slip(self, ops: Ops, slip_rad: Value, values: Parameters) -> Value:
-        """Slip angle of the front tyres [rad] from that of wheels at the angle of the servo, positive left."""
+        """Slip angle of the front tyres [rad] from that of wheels at the servo's angle.
+
+        It is positive where the force is to the right.
+        """
         return slip_rad
 
     def on_load(self, ops: Ops, forces: Forces, values: Parameters) -> None:
