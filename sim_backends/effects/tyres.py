@@ -89,7 +89,7 @@ class FrontWheelPlay(DynamicsEffect):
     """``a_f - clip(a_f, -angle, angle)`` in place of the slip angle a_f of the front wheels.
 
     The side force turns the wheels within the play of their linkage, until they reach its end. The play operator of
-    ``steering_backlash`` acts between servo and wheels instead, and its wheels keep their angle against the side force.
+    ``steering_backlash`` acts between servo and wheels instead, and the side force does not turn its wheels.
     """
 
     id = "front_wheel_play"
@@ -97,7 +97,7 @@ class FrontWheelPlay(DynamicsEffect):
     name = "play of the front wheels"
     summary = "The side force turns the front wheels within the play of their linkage."
     sentence = "the side force turns the front wheels by {angle} against the steering, within the play of their linkage"
-    refuted_if = "the front wheels of the parked car cannot be turned by hand while the servo holds its angle"
+    refuted_if = "the front wheels of the parked car cannot be turned by hand while the servo is powered"
     command = "steering"
     base_models = ("dynamic", "linear_tyre", "blend")
     parameters = (EffectParameter("angle", "rad", 0.0, 0.0, 0.3, 0.03),)

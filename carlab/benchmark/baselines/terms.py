@@ -54,7 +54,7 @@ def library(data: Prepared) -> dict[str, Term]:
         "tyre_relaxation": _relaxation,
         "battery_sag": _command_term_of_time(lambda t: 1.0 - 0.002 * t),
         "friction_drift": _grip(lambda s: (1.0 + 0.002 * s.t_s, 1.0 + 0.002 * s.t_s)),
-        "front_wheel_play": _grip(lambda s: (_beyond_play(s, 0.02), 1.0)),
+        "front_wheel_play": _grip(lambda s: (_slip_beyond_play(s, 0.02), 1.0)),
         "friction_ellipse": _grip(lambda s: (1.0, _combined(s, 0.3))),
         "combined_slip": _spinning,
         "load_transfer": _grip(lambda s: _transfer(s, 0.05)),
@@ -168,7 +168,7 @@ def _front_drive(s: Steps, middle: FloatArray, share: float) -> tuple[FloatArray
     return force * (np.cos(angle) - 1.0), across, s.car.front_axle * across
 
 
-def _beyond_play(s: Steps, play: float) -> FloatArray:
+def _slip_beyond_play(s: Steps, play: float) -> FloatArray:
     """Share of the front's slip angle beyond the play [rad]."""
     ahead = np.maximum(np.abs(s.middle[:, 3]), 0.3)
     slip = np.abs(np.arctan2(s.middle[:, 4] + s.car.front_axle * s.middle[:, 5], ahead) - _angle(s))

@@ -93,10 +93,16 @@ def sprung_play(world: World, p: Parameters) -> None:
     world.hooks["steer"].append(follow)
 
 
-def soft_deadband(world: World, p: Parameters) -> None:
-    """A dead-band with rounded edges."""
-    half = max(0.5 * p["width"], 1e-9)
-    world.steering_maps.append(lambda d: d - half * math.tanh(d / half))
+def soft_dead_band(value: float, half: float) -> float:
+    """A dead band with rounded edges: the result grows from zero with the third power."""
+    half = max(half, 1e-9)
+    return value - half * math.tanh(value / half)
+
+
+def soft_steering_deadband(world: World, p: Parameters) -> None:
+    """A dead band with rounded edges."""
+    half = 0.5 * p["width"]
+    world.steering_maps.append(lambda d: soft_dead_band(d, half))
 
 
 def linkage(world: World, p: Parameters) -> None:
@@ -156,7 +162,7 @@ FORMS = (
     Form("steering_lag", "other", servo_parameters, limited_servo, 0.01, 0.4),
     Form("steering_rate_limit", "other", inverse("rate"), soft_rate_limit, 0.1, 1.5),
     Form("steering_backlash", "other", plain("play"), sprung_play, 0.01, 0.4),
-    Form("steering_deadband", "other", plain("width"), soft_deadband, 0.01, 0.4),
+    Form("steering_deadband", "other", plain("width"), soft_steering_deadband, 0.01, 0.4),
     Form("steering_nonlinearity", "other", inverse("saturation"), linkage, 0.7, 2.2),
     Form("throttle_deadband", "other", plain("width"), soft_throttle_deadband, 0.01, 0.4),
     Form("throttle_nonlinearity", "other", plain("bend"), throttle_curve, 0.2, 4.0),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from carlab.benchmark.effects.alternative_command_forms import soft_dead_band
 from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, factor, heading, hook, plain, signed
 from carlab.benchmark.effects.force_forms import STICTION_MPS
 from carlab.benchmark.effects.tyre_forms import (
     driven_front,
     driven_wheels,
+    front_wheels_with_play,
     limit_over_grip,
-    loose_wheels,
     other_tyres,
     placed,
     saturating,
@@ -85,11 +86,6 @@ def powered_drag(now: Instant, p: Parameters, car: BaseCar) -> None:
 def scrub(now: Instant, p: Parameters, car: BaseCar) -> None:
     """Toe scrub of two front wheels: grows with the tangent of the wheel angle."""
     now.push_x -= p["coefficient"] * abs(math.tan(now.d)) * math.tanh(now.vx / 0.1)
-
-
-def beyond_elastic_play(slip: float, play: float) -> float:
-    """Play whose ends give way gradually: the tyres' slip grows from zero with the third power."""
-    return slip - play * math.tanh(slip / max(play, 1e-9))
 
 
 def brush_shape(b: float, c: float) -> Callable[[float], float]:
@@ -246,7 +242,7 @@ FORMS = (
     Form("aerodynamic_drag", "other", drag_parameters, powered_drag, 0.05, 1.5),
     Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
     Form("tyre_saturation", "other", saturating, other_tyres(brush_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
-    Form("front_wheel_play", "other", plain("angle"), loose_wheels(beyond_elastic_play), 0.01, 0.2),
+    Form("front_wheel_play", "other", plain("angle"), front_wheels_with_play(soft_dead_band), 0.01, 0.2),
     Form("all_wheel_drive", "other", plain("share"), driven_front(slipping_clutch), 0.1, 1.0),
     Form("friction_ellipse", "other", plain("scale"), combined_slip, 0.6, 4.0),
     Form("combined_slip", "other", limit_over_grip("grip_ratio"), spinning_wheels(brush_shape(1.0, 1.0)), 0.6, 3.0),

@@ -62,10 +62,15 @@ def steering_rate_limit(world: World, p: Parameters) -> None:
     world.hooks["steer"].insert(0, limit)
 
 
+def dead_band(value: float, half: float) -> float:
+    """Nothing within ``half``, which is subtracted from larger values."""
+    return value - min(max(value, -half), half)
+
+
 def steering_deadband(world: World, p: Parameters) -> None:
     """Angles below half the width have no influence; half the width is subtracted from larger angles."""
     half = 0.5 * p["width"]
-    world.steering_maps.append(lambda d: d - min(max(d, -half), half))
+    world.steering_maps.append(lambda d: dead_band(d, half))
 
 
 def play(width: float) -> Callable[[float], float]:

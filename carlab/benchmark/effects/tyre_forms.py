@@ -8,6 +8,7 @@ from collections.abc import Callable
 from scipy.optimize import brentq
 
 from carlab.benchmark.effects.catalogue import Attach, Draw, Form, Parameters, hook, plain, signed
+from carlab.benchmark.effects.command_forms import dead_band
 from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
 from carlab.benchmark.world.physics import SLIP_FLOOR_MPS, Instant, World, pacejka_shape
 
@@ -42,21 +43,16 @@ def other_tyres(shape: Callable[[float, float], Callable[[float], float]]) -> At
     return attach
 
 
-def loose_wheels(tyre_slip: Callable[[float, float], float]) -> Attach:
-    """Front wheels with play: ``tyre_slip`` gives the slip angle of the tyres from that of the servo and the play."""
+def front_wheels_with_play(tyre_slip: Callable[[float, float], float]) -> Attach:
+    """``tyre_slip`` gives the slip angle of the tyres from that of wheels at the servo's angle, and the play."""
 
     def attach(world: World, p: Parameters) -> None:
-        def turn(now: Instant) -> None:
+        def take_up_play(now: Instant) -> None:
             now.shape_f = world.shape_front(tyre_slip(now.alpha_f, p["angle"]))
 
-        world.hooks["load"].insert(0, turn)
+        world.hooks["load"].insert(0, take_up_play)
 
     return attach
-
-
-def beyond_play(slip: float, play: float) -> float:
-    """Nothing within the play; it is subtracted beyond."""
-    return math.copysign(max(abs(slip) - play, 0.0), slip)
 
 
 def driven_front(front_force: Callable[[float, float, BaseCar], float]) -> Attach:
@@ -250,7 +246,7 @@ def roll_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 FORMS = (
     Form("tyre_saturation", "catalogue", saturating, other_tyres(pacejka_shape), 0.5, 1.6, nominal_kind="linear_tyre"),
-    Form("front_wheel_play", "catalogue", plain("angle"), loose_wheels(beyond_play), 0.01, 0.2),
+    Form("front_wheel_play", "catalogue", plain("angle"), front_wheels_with_play(dead_band), 0.01, 0.2),
     Form("all_wheel_drive", "catalogue", plain("share"), driven_front(lambda fx, share, car: share * fx), 0.1, 1.0),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
     Form(
