@@ -11,6 +11,7 @@ from carlab.core.resource import Resource
 from drivers.config import MULTICAST_GROUP
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.links.bus_lock import BusLock, IdUse
 from drivers.links.can_link import open_bus
 from drivers.links.link import CanFrame
 from drivers.vesc import can_codec as vesc_can_codec
@@ -30,6 +31,8 @@ _SIMPLE = {
 
 class CanFirmware(Resource):
     """A ``VescFirmware`` on a CAN bus; one thread serves it between ``open`` and ``close``.
+
+    While open it holds the lock on its controller's id (``drivers.links.bus_lock``).
 
     Args:
         firmware: The firmware; its callbacks run in the serving thread.
@@ -54,6 +57,7 @@ class CanFirmware(Resource):
         self.channel = channel
         self.status_rate_hz = status_rate_hz
         self.faults = WireFaults() if faults is None else faults
+        self._lock = BusLock(interface, channel, firmware.controller_id, IdUse.EMULATOR)
         self._reassembler = CanReassembler(firmware.controller_id)
         self._bus: can.BusABC | None = None
         self._thread: threading.Thread | None = None
@@ -62,9 +66,10 @@ class CanFirmware(Resource):
         self._next_status_s = 0.0
 
     def open(self) -> None:
-        """Join the bus and start serving. Idempotent."""
+        """Join the bus and start serving. Idempotent. Raises NotReadyError if a program emulates this controller."""
         if self._thread is not None:
             return
+        self._lock.acquire()
         self.log.open()
         self._bus = open_bus(self.interface, self.channel, 500_000)
         self.log.add(time.monotonic(), "open")
@@ -81,6 +86,7 @@ class CanFirmware(Resource):
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
+        self._lock.release()
         self.log.close()
 
     def _serve(self, bus: can.BusABC) -> None:

@@ -1,13 +1,14 @@
-"""An exclusive lock on one id of a bus: two programs cannot command one motor controller, or receive one's replies.
+"""An exclusive lock on one id of a bus: two programs cannot command, or emulate, one motor controller.
 
 A CAN bus accepts any number of senders. Two programs that send to one motor controller alternate between the commands
-of both, and neither can see it. The frames of replies to one host id mix. The lock is a Unix socket with an abstract
-name (unix(7)): it excludes programs of all users of the computer, needs no file, and the kernel releases it when its
-process ends for any reason.
+of both, and neither can see it. The frames of replies to one host id mix, and so do those of two emulated controllers
+with one id. The lock is a Unix socket with an abstract name (unix(7)): it excludes programs of all users of the
+computer, needs no file, and the kernel releases it when its process ends for any reason.
 """
 
 from __future__ import annotations
 
+import enum
 import errno
 import hashlib
 import os
@@ -20,22 +21,37 @@ from carlab.core.errors import NotReadyError
 MAX_QUESTIONS = 4096
 """Number of programs that can ask for the holder; further ones do not learn its process."""
 
+MULTICAST_PORT = 43113
+"""UDP port of a ``udp_multicast`` bus whose channel has none (python-can's default)."""
+
+
+class IdUse(enum.Enum):
+    """Use of an id: the value is its name in messages, then the cause and the remedy with ``{}`` for the holder."""
+
+    CONTROLLER = ("Controller", "another program drives it ({}); end that program first.")
+    HOST = ("Host id", "another program uses it ({}); set another host_id in [hardware.actuator].")
+    EMULATOR = ("Emulated controller", "another program emulates it ({}); end that program or choose another channel.")
+
 
 class BusLock:
-    """Lock on a controller, or on this program's ``host`` id, at the bus ``interface`` ``channel``.
+    """Lock on an id at the bus ``interface`` ``channel``: of a controller, of this program or of an emulator.
 
-    Constructing does nothing.
+    Constructing does nothing. An emulated controller and the program that drives it have one id, so their locks do not
+    exclude each other.
 
     Two objects exclude each other, in one process too. A ``virtual`` bus exists within one process, and so does its
     lock.
     """
 
-    def __init__(self, interface: str, channel: str, can_id: int, *, is_host: bool = False) -> None:
-        self.what = f"{'Host id' if is_host else 'Controller'} {can_id} on CAN bus {interface} {channel}"
-        self._is_host = is_host
+    def __init__(self, interface: str, channel: str, can_id: int, use: IdUse = IdUse.CONTROLLER) -> None:
+        name, self._remedy = use.value
+        self.what = f"{name} {can_id} on CAN bus {interface} {channel}"
         bus = os.path.realpath(channel) if channel.startswith("/") else channel
+        if interface == "udp_multicast" and ":" not in channel:
+            bus = f"{channel}:{MULTICAST_PORT}"
         process = os.getpid() if interface == "virtual" else 0
-        key = hashlib.sha256(f"{interface}\0{bus}\0{can_id}\0{process}".encode()).hexdigest()[:24]
+        side = "\0emulator" if use is IdUse.EMULATOR else ""
+        key = hashlib.sha256(f"{interface}\0{bus}\0{can_id}\0{process}{side}".encode()).hexdigest()[:24]
         self._address = f"\0carlab-bus-{key}"
         self._socket: socket.socket | None = None
 
@@ -50,10 +66,7 @@ class BusLock:
         except OSError as error:
             own.close()
             if error.errno == errno.EADDRINUSE:
-                remedy = f"another program drives it ({self._holder()}); end that program first."
-                if self._is_host:
-                    remedy = f"another program uses it ({self._holder()}); set another host_id in [hardware.actuator]."
-                raise NotReadyError(f"{self.what} is in use", (remedy,)) from error
+                raise NotReadyError(f"{self.what} is in use", (self._remedy.format(self._holder()),)) from error
             remedy = f"the system does not allow its lock, a Unix socket ({error.strerror}); allow it."
             raise NotReadyError(f"{self.what} cannot be locked", (remedy,)) from error
         self._socket = own

@@ -12,7 +12,7 @@ from typing import Final
 import can
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
-from drivers.links.bus_lock import BusLock
+from drivers.links.bus_lock import BusLock, IdUse
 from drivers.links.link import CanFrame
 
 BUS_OFF: Final = 0x40
@@ -75,7 +75,7 @@ class CanLink:
         self._bus: can.BusABC | None = None
         self._descriptor: int | None = None
         self._locks = [
-            BusLock(interface, channel, can_id, is_host=can_id == host_id)
+            BusLock(interface, channel, can_id, IdUse.HOST if can_id == host_id else IdUse.CONTROLLER)
             for can_id in (controller_id, host_id)
             if can_id is not None
         ]

@@ -11,8 +11,9 @@ import socket
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.udp_multicast.bus import GeneralPurposeUdpMulticastBus
 
+from drivers.links.bus_lock import MULTICAST_PORT
+
 LOOPBACK = "127.0.0.1"
-DEFAULT_PORT = 43113
 
 
 class _LoopbackSocket(GeneralPurposeUdpMulticastBus):
@@ -46,5 +47,5 @@ class LoopbackMulticastBus(UdpMulticastBus):
 
     def __init__(self, channel: str) -> None:
         group, _, port = channel.partition(":")
-        self._multicast = _LoopbackSocket(group, int(port or DEFAULT_PORT), hop_limit=0)
+        self._multicast = _LoopbackSocket(group, int(port or MULTICAST_PORT), hop_limit=0)
         super(UdpMulticastBus, self).__init__(channel)

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 from carlab.cars import load_car_file
+from carlab.cars.emulated_car import free_udp_port
 from drivers.calibration import ActuatorCalibration
 from tests.helpers.command_line import Carlab
 
@@ -35,6 +36,22 @@ def test_printed_tables_are_a_car_file_with_the_emulated_calibration(tmp_path: P
     assert file.real is not None
     assert file.real.hardware.calibration == ActuatorCalibration()
     assert file.real.hardware.actuator.port == str(tmp_path / "vesc")
+
+
+def test_second_emulated_car_on_a_can_bus_is_refused(carlab: Carlab) -> None:
+    """Both would receive the commands, and their replies would mix."""
+    ports = ("--command-port", "0", "--data-port", "0", "--can-channel", f"239.74.163.2:{free_udp_port()}")
+    command = [sys.executable, "-m", "carlab", "emulate", "--actuator", "can", *ports]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert any(line.startswith("^C") for line in process.stdout)
+            code, text = carlab("emulate", "--actuator", "can", *ports)
+        finally:
+            process.send_signal(signal.SIGINT)
+    assert code == 3
+    assert f"is in use: another program emulates it (process {process.pid}, " in text
+    assert "end that program or choose another channel." in text
 
 
 def test_negative_seed_is_refused(carlab: Carlab, tmp_path: Path) -> None:

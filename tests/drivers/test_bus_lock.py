@@ -1,4 +1,4 @@
-"""Two programs cannot command one motor controller of a CAN bus."""
+"""Two programs cannot command, or emulate, one motor controller of a CAN bus."""
 
 from __future__ import annotations
 
@@ -128,6 +128,21 @@ def test_two_cars_on_one_bus_need_different_host_ids() -> None:
     first.close()
     second.open()
     second.close()
+
+
+def test_two_emulated_controllers_on_one_bus_need_different_ids() -> None:
+    """A channel without a port has the default port, so it is the same bus."""
+    group = f"239.74.163.{2 + uuid.uuid4().int % 250}"
+    first = CanFirmware(VescFirmware(CommandLog()), channel=group)
+    second = CanFirmware(VescFirmware(CommandLog()), channel=f"{group}:43113")
+    with first, CanFirmware(VescFirmware(CommandLog(), controller_id=24), channel=group):
+        with pytest.raises(NotReadyError, match=r"Emulated controller 23 on CAN bus .* end that program or choose"):
+            second.open()
+        link = CanLink("udp_multicast", group, controller_id=23)
+        link.open()
+        link.close()
+    with second:
+        pass
 
 
 @pytest.mark.parametrize(("interface", "channel"), [("no_such_interface", "x"), ("udp_multicast", "239.1.1.1:99999")])
