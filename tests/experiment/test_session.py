@@ -264,6 +264,20 @@ def test_no_episode_follows_a_requested_stop(tmp_path: Path, reason: EndReason, 
         assert ticks[-1] <= 5
 
 
+@pytest.mark.parametrize("ticks", [0, 1])
+def test_episode_without_a_tick_is_no_success_at_the_goal(tmp_path: Path, ticks: int) -> None:
+    class Neutral(Forward):
+        def act(self, view: PolicyInput) -> Action | None:
+            return Action() if view.step < ticks else None
+
+    with SimulatedCar() as car:
+        assert car.place(CarState())
+        (result,) = make_session(car, Neutral(), tmp_path, place=False).drive(1)
+    assert result.data.ticks == ticks
+    assert bool(result.summary["success"]) is (ticks > 0)
+    assert (ParkingTask().outcome(result.summary) == "parked") is (ticks > 0)
+
+
 def test_car_with_unknown_speed_does_not_count_as_still() -> None:
     class UnknownSpeedCar(SimulatedCar):
         def observe(self) -> Observation:

@@ -40,9 +40,14 @@ class EpisodeResult:
 
 
 def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
-    """Result of a recorded episode. Raises ConfigError if the task cannot evaluate it."""
+    """Result of a recorded episode; one without a complete tick has no success.
+
+    Raises ConfigError if the task cannot evaluate it.
+    """
     try:
         summary = {name: float(value) for name, value in task.summary(data.times_s, data.states).items()}
+        if data.ticks == 0 and "success" in summary:  # the car may stand at the goal, but it was not driven there
+            summary["success"] = 0.0
         if task.has_constraint:
             costs = np.asarray(task.cost(episode_features(data.states, data.sent, task.history_length)[1:]))
             summary |= {"cost": float(costs.sum()), "violations": float((costs > 0.0).sum())}
