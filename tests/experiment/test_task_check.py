@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from carlab.api.tasks import load_checked
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import rectangle
 from carlab.core.keep_out import Disc
@@ -135,20 +134,28 @@ def test_each_error_is_named_in_one_sentence(members: dict[str, Any], message: s
     assert "The task Changed has an error" in str(error.value)
 
 
-def test_path_outside_the_arena_of_the_car_is_refused() -> None:
-    with pytest.raises(ConfigError, match="its path leaves the arena"):
-        check_task(TASKS["laps"](), rectangle(-1.0, 1.0, -2.0, 2.0))
-
-
 def test_obstacles_that_cover_the_arena_are_refused() -> None:
     with pytest.raises(ConfigError, match="the keep-out shapes cover the arena"):
         check_task(ObstacleParkingTask(obstacles=(Disc(0.0, 0.0, 10.0),)))
 
 
-@pytest.mark.parametrize("name", ["parking", "obstacles"])
-def test_parking_is_refused_in_an_arena_without_its_start(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"the start \(.*\) is outside the arena"):
-        load_checked(choose_task(name), rectangle(-1.0, 1.0, -1.0, 1.0))
+@pytest.mark.parametrize(
+    ("task", "needed"),
+    [
+        (TASKS["parking"](), "start and goal need x 0 to 1.6 m, y -1.2 to 0 m"),
+        (TASKS["obstacles"](), "start and goal need x 0 to 1.6 m, y -1.2 to 0 m"),
+        (TASKS["laps"](), "start and path need x -1.7 to 1.7 m, y -1 to 0.9 m"),
+        (changed(goal=(3.06, 0.0, 0.0), success=Task.success), "start and goal need x 0 to 3.1 m, y -0.1 to 0.1 m"),
+    ],
+)
+def test_arena_of_the_car_that_is_too_small_is_no_error_of_the_task(task: Task, needed: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        check_task(task, rectangle(-1.0, 1.25, -1.0, 1.0))
+    text = str(error.value)
+    assert text.startswith("The arena of the car file (x -1 to 1.25 m, y -1 to 1 m) is too small for the task ")
+    assert f"the task {task.name}, whose {needed} and room to drive; enlarge [hardware.arena] (" in text
+    assert "\n" not in text
+    check_task(task, rectangle(-5.0, 5.0, -5.0, 5.0))
 
 
 def test_numbers_of_numpy_in_a_summary_and_tensors_with_gradient_are_accepted() -> None:

@@ -42,14 +42,14 @@ def check_task(task: Task, arena_m: Corners = ()) -> None:
         arena_m: arena of the car; empty: that of the task.
 
     Raises:
-        ConfigError: names the method or attribute, what it returned, and what it must return.
+        ConfigError: names the method or attribute, what it returned, and what it must return; or the arena of the car
+            is too small for the task.
     """
     _check_attributes(task)
-    arena_m = arena_m or task.arena_m
-    starts = _starts(task, arena_m)
-    _check_goal(task, arena_m)
-    if arena_m and not all(contains(arena_m, x, y) for x, y in task.path_m):
-        raise _error(task, f"its path leaves the arena; {_METRES}; move the path or enlarge [hardware.arena]")
+    starts = _starts(task)
+    _check_goal_pose(task)
+    _check_arena(task, starts[:, :2], arena_m)
+    _check_goal(task)
     rng = np.random.default_rng(0)
     before = _features(task, starts, rng)
     after = _features(task, starts + rng.normal(0.0, (0.05, 0.05, 0.1, 0.3, 0.05, 0.3), starts.shape), rng)
@@ -125,7 +125,7 @@ def _is_row(values: Any, length: int) -> bool:
     )
 
 
-def _starts(task: Task, arena_m: Corners) -> FloatArray:
+def _starts(task: Task) -> FloatArray:
     """States of ``N_STARTS`` starts (N, 6)."""
     starts = []
     for seed in range(N_STARTS):
@@ -138,11 +138,6 @@ def _starts(task: Task, arena_m: Corners) -> FloatArray:
             raise _error(task, f"sample_start has a yaw of {start.yaw_rad:.4g}; angles are in radians")
         if start.speed_mps > MAX_SPEED_MPS:
             raise _error(task, f"sample_start has a speed of {start.speed_mps:.4g}; speeds are in m/s")
-        if arena_m and not contains(arena_m, start.x_m, start.y_m):
-            raise _error(
-                task, f"the start ({start.x_m:.2f}, {start.y_m:.2f}) is outside the arena; {_METRES}, in the frame of "
-                "motion capture",
-            )  # fmt: skip
         starts.append(state)
     return np.array(starts)
 
@@ -157,17 +152,50 @@ def _drawn(task: Task, name: str, seed: int) -> CarState:
     return start
 
 
-def _check_goal(task: Task, arena_m: Corners) -> None:
+def _check_goal_pose(task: Task) -> None:
     goal = task.goal
     if goal is None:
         return
     if not _is_row(goal, 3):
         raise _error(task, f"goal is {goal!r}; give a tuple of x [m], y [m] and yaw [rad], or None")
+    if abs(goal[2]) > 2.0 * math.pi:
+        raise _error(task, f"the goal has a yaw of {goal[2]:.4g}; angles are in radians")
+
+
+def _check_arena(task: Task, starts_m: FloatArray, arena_m: Corners) -> None:
+    """Check that starts (N, 2), goal and path are inside the arena of the car, or of the task if the car has none."""
+    goals_m = [] if task.goal is None else [task.goal[:2]]
+    places_m = {"start": starts_m.tolist(), "goal": goals_m, "path": list(task.path_m)}
+    outside = [
+        (name, x, y)
+        for name, points in places_m.items()
+        for x, y in points
+        if (arena_m or task.arena_m) and not contains(arena_m or task.arena_m, x, y)
+    ]
+    if outside and not arena_m:
+        name, x, y = outside[0]
+        raise _error(task, f"the {name} ({x:.4g}, {y:.4g}) is outside the arena; {_METRES}")
+    if outside:
+        tenths = np.round(10.0 * np.array([point for points in places_m.values() for point in points]), 6)
+        needed_m = np.stack([np.floor(tenths), np.ceil(tenths)]).reshape(-1, 2) / 10.0
+        raise ConfigError(
+            f"The arena of the car file ({_extent(arena_m)}) is too small for the task {task.name}, whose "
+            f"{' and '.join(name for name, points in places_m.items() if points)} need {_extent(needed_m)} and room to "
+            f"drive; enlarge [hardware.arena] ({_METRES}, in the frame of motion capture), or choose another task."
+        )
+
+
+def _extent(points_m: Any) -> str:
+    """Text of the smallest rectangle around points (N, 2) [m]."""
+    low, high = np.min(points_m, axis=0) + 0.0, np.max(points_m, axis=0) + 0.0  # without a negative zero
+    return f"x {low[0]:.4g} to {high[0]:.4g} m, y {low[1]:.4g} to {high[1]:.4g} m"
+
+
+def _check_goal(task: Task) -> None:
+    goal = task.goal
+    if goal is None:
+        return
     values = np.asarray(goal, dtype=np.float64)
-    if abs(values[2]) > 2.0 * math.pi:
-        raise _error(task, f"the goal has a yaw of {values[2]:.4g}; angles are in radians")
-    if arena_m and not contains(arena_m, float(values[0]), float(values[1])):
-        raise _error(task, f"the goal ({values[0]:.4g}, {values[1]:.4g}) is outside the arena; {_METRES}")
     if any(bool(shape.contains(values[:2])) for shape in task.keep_out):
         raise _error(task, f"the goal ({values[0]:.4g}, {values[1]:.4g}) is in a keep-out shape; move one of them")
     if type(task).success is not Task.success:
