@@ -74,7 +74,8 @@ def warn(message: str) -> None:
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:
     """Print a table; with ``numeric``, the columns after the first are right-aligned.
 
-    A terminal that is too narrow for the table's words and numbers gets one paragraph for each row.
+    A terminal that is too narrow for the table's words and numbers gets one paragraph for each row. A file or a pipe
+    gets one line for each row of a numeric table.
     """
     # Text instead of str: rich would interpret the unit "[m]" as mark-up.
     rich_table = Table(
@@ -91,8 +92,12 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
         rich_table.add_row(*(Text(cell) for cell in row))
     if title:
         console.print()
-    if Measurement.get(console, console.options.update(max_width=MAX_TABLE_CHARS), rich_table).minimum <= console.width:
-        console.print(rich_table)
+    needed = Measurement.get(console, console.options.update(max_width=MAX_TABLE_CHARS), rich_table)
+    is_in_full = numeric and not console.is_terminal
+    if is_in_full:
+        rich_table.width = needed.maximum
+    if is_in_full or needed.minimum <= console.width:
+        console.print(rich_table, crop=not is_in_full)
         return
     if title:
         console.print(Text(title, "bold"))

@@ -62,6 +62,7 @@ def test_findings_are_paragraphs_in_a_narrow_terminal(
 ) -> None:
     """A table of five columns leaves 14 characters for the sentence, whose words stand between those of other cells."""
     monkeypatch.setattr(console, "_width", width)
+    monkeypatch.setattr(console, "_force_terminal", True)
     path, data = canonical_csv(tmp_path, rows=60)
     data[:, 8] = 0.3
     code, text = carlab("import", write(path, data))
@@ -87,11 +88,26 @@ def test_narrow_terminal_splits_no_number(
     width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(console, "_width", width)
+    monkeypatch.setattr(console, "_force_terminal", True)
     columns = ["model", "position [m]", "yaw [rad]", "vx [m/s]", "vy [m/s]", "score"]
     table("Errors", columns, [["noise floor", "1.0551", "0.8250", "0.4844", "0.3147", "132.48"]])
     text = capsys.readouterr().out
     assert re.findall(r"[\d.]+", text) == ["1.0551", "0.8250", "0.4844", "0.3147", "132.48"]
     assert max(map(len, text.splitlines())) <= width
+
+
+@pytest.mark.parametrize("length", [60, 200])
+def test_table_in_a_pipe_has_one_line_for_each_row(length: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """A terminal of 140 characters folds the words of the first length, and cannot show the word of the second."""
+    name = "n" * length
+    columns = ["held out", "model", "after [s]", "position rms [m]", "median [m]", "yaw rms [rad]", "windows"]
+    model = "diagnosed, physics outside the catalogue"
+    table("Errors", columns, [[name, model, "0.3", "0.014", "0.011", "0.022", "1200"]])
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert [re.split(r" {3,}", line) for line in (lines[2], lines[-1])] == [
+        columns,
+        [name, model, "0.3", "0.014", "0.011", "0.022", "1200"],
+    ]
 
 
 @pytest.mark.parametrize("verb", ["diagnose", "compare"])
