@@ -27,6 +27,8 @@ REPORTED_FAULTS = (
 """Findings of the CSV audit that the report lists as data faults if they were repaired."""
 LEFT_OUT_ROWS = ("not_a_number", "stamp_order")
 """Findings of the CSV audit about rows that were left out; the report lists them too."""
+INCOMPLETE_FILE = "incomplete_file"
+"""Data fault of an MCAP file of which only the complete ticks were recovered; its channel is the path."""
 
 
 @dataclass(slots=True)
@@ -135,7 +137,7 @@ def load_recordings(items: list[RecordingSource], role: str, latency_s: float) -
 
 def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
     """Add the episodes of one recording."""
-    from carlab.diagnosis.findings import RecordingUse
+    from carlab.diagnosis.findings import DataFault, RecordingUse
     from carlab.diagnosis.state_alignment import align_states
 
     if isinstance(item, EpisodeData):
@@ -150,7 +152,9 @@ def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: Loade
         read = item if isinstance(item, Recording) else load(path)
         loaded.episodes += [align_states(_without_corrupt_numbers(each), latency_s) for each in read.episodes]
         if read.is_recovered:
-            loaded.notes.append(f"{path} {read.recovery}.")
+            missing_ticks = int(read.episode.metadata.get("missing_ticks", 0))
+            text = f"reported: the file {read.recovery}."
+            loaded.faults.append(DataFault(INCOMPLETE_FILE, str(path), missing_ticks, text))
     return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
 
 

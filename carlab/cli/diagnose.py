@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from carlab.api.diagnosis import diagnose
+from carlab.api.loaded_recordings import INCOMPLETE_FILE
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of, report_folder
@@ -60,6 +61,9 @@ class Diagnose:
         report_folder(self.out)
         with search_callbacks("diagnosis") as callbacks:
             report = diagnose(**arguments_of(self, diagnose), **callbacks)
+        for fault in report.diagnosis.data_faults:
+            if fault.id == INCOMPLETE_FILE:
+                console.print(f"{fault.channel}: {fault.action}", style="yellow", soft_wrap=True)
         if not report.is_conclusive:
             fail(report.sentence)
             return 0 if report.verdict == "data" else EXIT_INCONCLUSIVE
@@ -74,8 +78,9 @@ class Diagnose:
         from carlab.diagnosis.report.events import diagnosed_event_sentences
         from carlab.diagnosis.report.residual import shown_errors
 
-        if diagnosis.data_faults:
-            faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in diagnosis.data_faults)
+        others = [fault for fault in diagnosis.data_faults if fault.id != INCOMPLETE_FILE]
+        if others:
+            faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in others)
             console.print(f"Faults of the recordings (listed in the report): {', '.join(faults)}.")
         console.print(diagnosis.sentence)
         sentences = [effect.sentence for effect in diagnosis.effects] + curve_sentences(diagnosis)

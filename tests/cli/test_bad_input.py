@@ -1,5 +1,6 @@
 """Invalid input is refused with one sentence, the next step and a non-zero exit code; never with a traceback."""
 
+import json
 import math
 import os
 import re
@@ -238,6 +239,22 @@ def test_truncated_mcap_is_recovered_and_mcap_without_ticks_is_refused(carlab: C
         assert code == 1
         assert "truncated.mcap" in text
         assert not (tmp_path / "cut.rrd").exists()
+
+
+def test_verbs_that_fit_name_a_truncated_mcap_and_the_report_lists_it(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    recording = tmp_path / "drive.mcap"
+    assert carlab("import", write(path, data), "--out", recording)[0] == 0
+    recording.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
+    named = f"{recording}: reported: the file ends at byte {recording.stat().st_size} before its closing record"
+    out = tmp_path / "diagnosis"
+    for verb in (("diagnose", "--out", out), ("replay",)):
+        code, text = carlab(*verb, recording)
+        assert named in text, (code, text)
+        assert "complete ticks were recovered; copy it again." in text
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert [fault["id"] for fault in report["data_faults"]] == ["incomplete_file"]
+    assert "complete ticks were recovered" in (out / "report.html").read_text(encoding="utf-8")
 
 
 def test_import_does_not_overwrite_a_recording(carlab: Carlab, tmp_path: Path) -> None:
