@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 from carlab.core.episode_data import EpisodeData
@@ -124,10 +125,11 @@ def diagnose(
     stages = curves, ceiling, discrepancy, adapt, keep_events
     request = Request(nominal, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
-    control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, workers or FunctionWorkers())
-    recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
-    scored, naming = _search_effects(recordings, noise, request, control, timer)
-    outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
+    with FunctionWorkers() if workers is None else nullcontext(workers) as shared:
+        control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, shared)
+        recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
+        scored, naming = _search_effects(recordings, noise, request, control, timer)
+        outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
     return _with_run(outcome, timer, effects or (), decisions)
 
 
