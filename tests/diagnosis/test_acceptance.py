@@ -1,14 +1,16 @@
-"""A candidate is accepted exactly if the conditions hold that its decision records."""
+"""A candidate is accepted, and an effect kept, exactly if the conditions hold that its decision records."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from carlab.diagnosis.decisions import Decision, passes
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.candidates import acceptance, accepted, is_accepted
+from carlab.diagnosis.selection.elimination import Deletion, eliminate
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
@@ -78,3 +80,21 @@ def test_simpler_candidate_is_next_if_left_out_blocks_do_not_distinguish_it(
     model = Model((), strong.fit, Scale(np.array([1]), np.ones((1, 6))))
     chosen = accepted(problem, model, candidates, RunControl())
     assert [c.effect for c in chosen] == [expected, other if expected == best else best]
+
+
+@pytest.mark.parametrize("offset", [-1e-9, 0.0, 1e-9])
+def test_effect_is_kept_exactly_if_its_recorded_condition_holds(
+    problem: SearchProblem, strong: Candidate, monkeypatch: pytest.MonkeyPatch, offset: float
+) -> None:
+    rise = problem.settings.selection.keep_z_min + offset
+
+    def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> dict[str, Deletion]:
+        return {name: Deletion(strong.fit, rise) for name in model.effects}
+
+    monkeypatch.setattr("carlab.diagnosis.selection.elimination.delete_each", delete_each)
+    named = ("aerodynamic_drag", "steering_lag")
+    model = Model(named, strong.fit, Scale(np.array([1]), np.ones((1, 6))))
+    decisions: list[Decision] = []
+    kept = eliminate(problem, model, RunControl(record=decisions.append)).model.effects == named
+    assert [decision.passed for decision in decisions] == [kept]
+    assert [passes(decision.alternatives) for decision in decisions] == [kept]

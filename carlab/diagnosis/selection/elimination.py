@@ -56,10 +56,9 @@ def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> Elim
     while len(model.effects) > 1 and not control.stop():
         weakest = min(deletions, key=lambda name: deletions[name].standard_errors)
         z = deletions[weakest].standard_errors
-        kept = z >= keep_z_min
         condition = Condition("selection.keep_z_min", z, keep_z_min)
-        control.record(Decision("keep", weakest, ((condition,),), kept, len(model.effects)))
-        if kept:
+        control.record(Decision("keep", weakest, ((condition,),), condition.holds, len(model.effects)))
+        if condition.holds:
             break
         log.info("removed %s: the loss on left-out blocks rises by %.1f standard errors only", weakest, z)
         model = Model(tuple(e for e in model.effects if e != weakest), deletions[weakest].without, model.scale)

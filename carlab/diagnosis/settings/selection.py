@@ -105,7 +105,7 @@ class SelectionSettings:
     limit_start_ratios: tuple[float, ...] = (1.0, 1.7, 3.0)
     """Initial values of an effect's only limit, over that of the best screening point [1]."""
     keep_z_min: float = 1.2
-    """One of several effects is removed if its removal costs less than this on left-out blocks [standard errors]."""
+    """One of several effects is removed if its removal costs this or less on left-out blocks [standard errors]."""
     supported_z_min: float = 1.6449
     """Minimum rise of the loss on left-out blocks without a requested effect, with decorrelated errors [standard
     errors]: a one-sided test at 5 % (docs/decisions/0036)."""
