@@ -195,6 +195,33 @@ class ColumnMapping:
             sources[channel] = from_table(ColumnSource, {**source, **changes}, f"the changes to {channel}")
         return dataclasses.replace(self, columns=sources, **{name: getattr(checked, name) for name in options})
 
+    def combined(self, option: str) -> str:
+        """An option of ``carlab import`` that corrects a recording in addition to this mapping.
+
+        An option replaces a declared sign, scale, unit or swap, so it has to contain the declared one.
+        """
+        if option == "--swap-xy" and self.swap_xy:
+            return "--no-swap-xy"
+        return _PART_OPTION.sub(self._combined_part, option)
+
+    def _combined_part(self, match: re.Match[str]) -> str:
+        flag, part, value = match.groups()
+        channel = flag.replace("-", "_")
+        source = self.columns.get(channel, ColumnSource(channel))
+        if part == "sign":
+            return f"--{flag}-sign {source.sign * int(value)}"
+        if part == "unit":
+            if source.unit is None or UNITS[channel][source.unit] == 1.0 or channel not in VELOCITY_CHANNELS:
+                return match[0]  # A pose has no option for its scale.
+            value = str(UNITS[channel][value])
+        elif source.scale == 1.0:
+            return match[0]
+        return f"--{flag}-scale {source.scale * float(value):.4g}"
+
+
+_PART_OPTION = re.compile(r"--([a-z-]+)-(sign|scale|unit) (\S+)")
+"""Option that changes a part of a ``ColumnSource``."""
+
 
 def _check_lag(option: str, lag_s: float) -> None:
     """Raise ConfigError for a lag [s] that no logger has."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from carlab.core.angles import wrap
-from carlab.recording.audit.report import Severity
+from carlab.recording.audit.report import RefusedError, Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
@@ -124,6 +124,43 @@ def test_fault_is_found_and_repaired_by_its_option(clean, fault, finding, option
     truth = foreign.drive(UNEVEN)
     np.testing.assert_allclose(repaired.episode.states[:, 3], truth["vx"], atol=0.1)
     np.testing.assert_allclose(repaired.episode.states[:, 5], truth["yaw_rate"], atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("options", "finding", "proposed"),
+    [
+        ({"columns": {"steering": {"sign": -1}}}, ("wrong_sign", "steering"), "--steering-sign 1"),
+        ({"columns": {"throttle": {"sign": -1}}}, ("wrong_sign", "throttle"), "--throttle-sign 1"),
+        ({"columns": {"vx": {"sign": -1}}}, ("wrong_sign", "vx"), "--vx-sign 1"),
+        ({"columns": {"yaw": {"sign": -1}}}, ("wrong_sign", "yaw"), "--yaw-sign 1"),
+        ({"swap_xy": True}, ("wrong_frame", "yaw"), "--no-swap-xy"),
+    ],
+    ids=["steering sign", "throttle sign", "vx sign", "yaw sign", "swap"],
+)
+def test_wrong_option_of_the_import_is_withdrawn_by_the_proposed_one(clean, options, finding, proposed, tmp_path):
+    """An option replaces the declared sign, scale or swap: the same option again would change nothing."""
+    found = warnings_of(import_drive(tmp_path, clean, **options).report)[finding]
+    assert found.option == proposed
+    assert proposed in found.sentence
+
+
+@pytest.mark.parametrize(("largest", "declared", "proposed"), [(1.0, 5.0, 1.0), (40.0, 0.05, 0.025)])
+def test_proposed_command_scale_replaces_the_declared_one(clean, largest, declared, proposed, tmp_path):
+    columns = {**clean, "steering": largest * clean["steering"] / np.abs(clean["steering"]).max()}
+    with pytest.raises(RefusedError) as refusal:
+        import_drive(tmp_path, columns, columns={"steering": {"scale": declared}})
+    option, scale = refusal.value.findings[0].option.split()
+    assert option == "--steering-scale"
+    assert float(scale) == pytest.approx(proposed, rel=0.01)
+
+
+def test_proposed_scale_contains_the_declared_scale_and_unit(clean, tmp_path):
+    columns = {**clean, "yaw_rate": 0.5 * clean["yaw_rate"], "vx": 360 * clean["vx"], "vy": 360 * clean["vy"]}
+    declared = {"yaw_rate": {"scale": 4.0}, "vx": {"unit": "km/h"}, "vy": {"unit": "km/h"}}
+    warnings = warnings_of(import_drive(tmp_path, columns, columns=declared).report)
+    options = f"{warnings['column_scale', 'yaw_rate'].option} {warnings['wrong_unit', 'vx, vy'].option}".split()
+    scales = dict(zip(options[::2], (float(value) for value in options[1::2]), strict=True))
+    assert scales == pytest.approx({"--yaw-rate-scale": 2.0, "--vx-scale": 0.01, "--vy-scale": 0.01}, rel=0.01)
 
 
 @pytest.mark.parametrize("offset_rad", [0.8, 1.57, 2.5, 3.14159, -1.2, -2.9])

@@ -5,6 +5,7 @@ The audit does not change the data. Each finding has evidence and, if available,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -44,10 +45,6 @@ MIN_MOVING_ROWS, MIN_TURNING_ROWS = 50, 30
 MIN_COMMAND_RANGE = 0.05
 """Minimum range of a command (full command = 1) for a check of its sign."""
 EFFECTS = {"steering": "the path's curvature", "throttle": "the acceleration"}
-SIGN_REMEDIES = {
-    "steering": "use --steering-sign -1",
-    "throttle": "use --throttle-sign -1, or --yaw-offset 3.1416 if yaw points to the rear",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,20 +125,32 @@ def _finding(fault: Fault, mapping: ColumnMapping) -> Finding:
     """A fault of columns, by their names. A unit that is not SI and not declared is an error."""
     if fault.id == "too_little_motion":
         return Finding.of_fault(fault, Severity.INFO)
+    alternative = " (or --x-unit m --y-unit m if it is so)" if fault.channel == "x, y" else ""
+    if fault.option == "--yaw-sign -1":
+        alternative = f" (or {mapping.combined('--y-sign -1')})"
     if "offset_rad" in fault.evidence:  # the option replaces the offset of the mapping
         offset_rad = wrap(mapping.yaw_offset_rad + fault.evidence["offset_rad"])
         fault = replace(fault, option=f"--yaw-offset {offset_rad:.3f}")
+    fault = replace(fault, option=mapping.combined(fault.option or ""))
     sources = [mapping.columns[channel] for channel in fault.channel.split(", ")]
     severity, remedy = Severity.FAULT, f"use {fault.option}"
     if fault.id == "wrong_unit" and not sources[0].unit:
         severity, remedy = Severity.ERROR, f"say so with {fault.option}"
     elif fault.channel == "x, y":
         severity = Severity.WARNING
-    alternative = {"x, y": " (or --x-unit m --y-unit m if it is so)", "--yaw-sign -1": " (or --y-sign -1)"}
-    remedy += alternative.get(fault.channel, alternative.get(fault.option or "", ""))
     names = ", ".join(f"'{source.name}'" for source in sources)
     named = replace(fault, observation=f"{'Columns' if len(sources) > 1 else 'Column'} {names}: {fault.observation}")
-    return Finding.of_fault(named, severity, remedy)
+    return Finding.of_fault(named, severity, remedy + alternative)
+
+
+def _sign_finding(fault: Fault, mapping: ColumnMapping) -> Finding:
+    """The fault of a command with the wrong sign. Throttle also looks like one if yaw points to the rear."""
+    fault = replace(fault, option=mapping.combined(fault.option or ""))
+    remedy = f"use {fault.option}"
+    if fault.channel == "throttle":
+        offset_rad = mapping.yaw_offset_rad + (math.pi if mapping.yaw_offset_rad <= 0.0 else -math.pi)
+        remedy += f", or --yaw-offset {offset_rad:.5g} if yaw points to the rear"
+    return Finding.of_fault(fault, remedy=remedy)
 
 
 def _check_velocities(
@@ -286,8 +295,7 @@ def _check_commands(
                 sentence = f"{channel.capitalize()} explains too little of {effect}: its sign is unknown."
                 findings.append(Finding("unclear_sign", channel, Severity.INFO, sentence, evidence=evidence))
         elif response.gain < 0 and response.lag_s > -LIMITS.early_response_s:
-            fault = wrong_command_sign(channel, response, evidence)
-            findings.append(Finding.of_fault(fault, remedy=SIGN_REMEDIES[channel]))
+            findings.append(_sign_finding(wrong_command_sign(channel, response, evidence), mapping))
         elif response.is_lag_inside:  # at the edge, the drive does not show the delay
             delay_s = evidence["delay_s"]
             sentence = (

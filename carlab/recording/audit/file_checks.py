@@ -297,7 +297,8 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
         beyond = np.abs(column) > 1.0 + 1e-6
         if beyond.any():
             severity = Severity.ERROR if largest > MAX_COMMAND else Severity.WARNING
-            option: str | None = f"--{channel}-scale {_rounded_down(1.0 / _full_scale(channel, largest))}"
+            unscaled = max(largest / abs(mapping.columns[channel].scale), 1.0)  # the option replaces this scale
+            option: str | None = f"--{channel}-scale {_rounded_down(1.0 / _full_scale(channel, unscaled))}"
             remedy = f"say what full command is, for example {option}"
             if float(column.min()) >= MIN_PULSE:
                 option = None
