@@ -76,14 +76,34 @@ def test_chunks_after_a_damaged_one_are_read(path, index):
         assert int(episode.metadata["missing_ticks"]) == TICKS - episode.ticks
 
 
-def test_damaged_header_of_a_chunk_ends_the_reading(path):
-    """The length of the record is wrong, so the next record cannot be found."""
-    start = chunks_of(path)[4][0]
+@pytest.mark.parametrize("offset", [1, 7], ids=["length inside the file", "length beyond the file"])
+def test_damaged_header_of_a_chunk_loses_this_chunk_at_most(path, offset):
+    """The length of the record is wrong; the index at the end of the file states where the next chunk begins."""
+    start, _, ticks = chunks_of(path)[4]
     assert path.read_bytes()[start] == Opcode.CHUNK
-    flip(path, start + 7)
+    flip(path, start + offset)
     episode = read_episode(path)
-    assert 0 < episode.ticks < TICKS
-    assert episode.metadata["recovery"].startswith(f"is damaged at byte {start}; {episode.ticks} of {TICKS} ticks")
+    assert episode.ticks >= TICKS - ticks - 2
+    assert f"; {episode.ticks} of {TICKS} ticks were recovered" in episode.metadata["recovery"]
+    assert episode.metadata["end_reason"] == "GOAL_REACHED"
+
+
+def test_zeros_over_several_chunks_lose_these_chunks_only(path):
+    """A block of the disk is lost: its zeros contain headers of chunks."""
+    chunks = chunks_of(path)
+    first, last = chunks[2][0] + 100, chunks[4][0] + 100
+    content = path.read_bytes()
+    path.write_bytes(content[:first] + bytes(last - first) + content[last:])
+    lost = sum(ticks for _, _, ticks in chunks[2:5])
+    assert TICKS - lost - 2 <= read_episode(path).ticks <= TICKS - lost
+
+
+def test_damaged_beginning_loses_no_tick(path):
+    content = path.read_bytes()
+    path.write_bytes(content[:8] + bytes(20) + content[28:])
+    episode = read_episode(path)
+    assert episode.ticks == TICKS
+    assert episode.metadata["recovery"].startswith("is damaged at byte 8; ")
 
 
 def test_truncated_recording_is_not_called_unfinished(path):
@@ -107,8 +127,9 @@ def test_saved_copy_of_a_damaged_recording_is_not_damaged(path, tmp_path):
 
 def test_recording_without_a_readable_tick_names_the_damage(path):
     start = chunks_of(path)[0][0]
+    end = sum(chunks_of(path)[-1][:2])
     content = path.read_bytes()
-    path.write_bytes(content[:8] + bytes(20) + content[28:])
+    path.write_bytes(content[:8] + bytes(end - 8) + content[end:])
     with pytest.raises(DataError, match=r"0001\.mcap holds no complete tick and is damaged at byte 8; copy it again"):
         read_episode(path)
     for size in (300, start + 10):

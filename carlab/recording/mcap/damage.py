@@ -40,15 +40,39 @@ class FileDefect:
 UNFINISHED = FileDefect("is incomplete, because its writer was stopped", "")
 
 
+@dataclass(frozen=True, slots=True)
+class _Index:
+    """What the summary at the end of a file states; empty if the summary is missing or damaged.
+
+    Attributes:
+        channels: channels of all messages.
+        ticks_written: number of ticks; None if it is unknown.
+        record_starts: positions of chunks, attachments and metadata, in ascending order.
+    """
+
+    channels: tuple[Channel, ...] = ()
+    ticks_written: int | None = None
+    record_starts: tuple[int, ...] = ()
+
+
+class _DamagedChunkError(Exception):
+    """A chunk whose content cannot be read; ``end`` is the position after it."""
+
+    def __init__(self, end: int) -> None:
+        super().__init__()
+        self.end = end
+
+
 def read_records(file: IO[bytes], take: Callable[[object], None], skip: Callable[[], None]) -> FileDefect | None:
     """Pass all readable records of a file to ``take``.
 
-    A chunk that does not match its checksum is left out: ``skip`` is called, and later chunks are read.
+    A damaged chunk is left out: ``skip`` is called, and later chunks are read. The index at the end of the file gives
+    their positions.
 
     Args:
         file: an MCAP file, opened for reading.
         take: receives each record that is not a chunk, and the records of each chunk.
-        skip: is called for each chunk that is left out.
+        skip: is called for each damaged part that is left out.
 
     Returns:
         What is wrong with the file; None if it is complete.
@@ -58,34 +82,29 @@ def read_records(file: IO[bytes], take: Callable[[object], None], skip: Callable
     """
     size = os.fstat(file.fileno()).st_size
     has_end = _has_end(file, size)
-    channels, ticks_written = _summary(file, size) if has_end else ((), None)
-    file.seek(0)
+    index = _index(file, size) if has_end else _Index()
     damaged_at: int | None = None
-    start = len(MAGIC)
-    try:
-        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size)
-        for record in reader.records:
-            for content in _contents(record) if isinstance(record, Chunk) else [record]:
-                if content is not None:
-                    take(content)
-                elif file.tell() < size:
-                    damaged_at = start if damaged_at is None else damaged_at
-                    skip()
-                    for channel in channels:  # The first chunk holds them.
-                        take(channel)
-            start = file.tell()
-    except OSError:
-        raise
-    except Exception as error:
-        # mcap, zstandard and protobuf raise different errors for damaged bytes.
-        if damaged_at is None and isinstance(error, CRCValidationError) and isinstance(error.record, DataEnd):
-            return FileDefect("does not match its checksum", "copy it again", ticks_written)
-        damaged_at = start if damaged_at is None and has_end else damaged_at
-    else:
-        if damaged_at is None:
-            return None
+    start = 0
+    while (failure := _read_from(file, start, size, take)) is not None:
+        position, error = failure
+        if isinstance(error, CRCValidationError) and isinstance(error.record, DataEnd):
+            if damaged_at is None:
+                return FileDefect("does not match its checksum", "copy it again", index.ticks_written)
+            break
+        end = error.end if isinstance(error, _DamagedChunkError) else size
+        next_start = next((k for k in index.record_starts if k > position), end)
+        if next_start < size or has_end:
+            damaged_at = position if damaged_at is None else damaged_at
+        if next_start >= size:
+            break
+        skip()
+        for channel in index.channels:  # The first chunk holds them.
+            take(channel)
+        start = next_start
     if damaged_at is not None:
-        return FileDefect(f"is damaged at byte {damaged_at}", "copy it again", ticks_written)
+        return FileDefect(f"is damaged at byte {damaged_at}", "copy it again", index.ticks_written)
+    if failure is None:
+        return None
     if str(file.name).endswith(PARTIAL_SUFFIX):
         return UNFINISHED
     return FileDefect(
@@ -94,12 +113,29 @@ def read_records(file: IO[bytes], take: Callable[[object], None], skip: Callable
     )
 
 
-def _contents(chunk: Chunk) -> list[object | None]:
-    """Records of a chunk; ``[None]`` if it is damaged."""
+def _read_from(file: IO[bytes], start: int, size: int, take: Callable[[object], None]) -> tuple[int, Exception] | None:
+    """Read records from a position on. Returns the position of the first unreadable one, and the error."""
+    file.seek(start)
+    position = max(start, len(MAGIC))
+    try:
+        reader = StreamReader(file, skip_magic=start > 0, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+        for record in reader.records:
+            for content in _contents(record, file.tell()) if isinstance(record, Chunk) else [record]:
+                take(content)
+            position = file.tell()
+    except OSError:
+        raise
+    except Exception as error:  # mcap, zstandard and protobuf raise different errors for damaged bytes.
+        return position, error
+    return None
+
+
+def _contents(chunk: Chunk, end: int) -> list[object]:
+    """Records of a chunk. Raises _DamagedChunkError, with the position ``end`` after it, if it is damaged."""
     try:
         return [*breakup_chunk(chunk, validate_crc=True)]
-    except Exception:
-        return [None]
+    except Exception as error:
+        raise _DamagedChunkError(end) from error
 
 
 def _has_end(file: IO[bytes], size: int) -> bool:
@@ -110,15 +146,19 @@ def _has_end(file: IO[bytes], size: int) -> bool:
     return file.read() == MAGIC
 
 
-def _summary(file: IO[bytes], size: int) -> tuple[tuple[Channel, ...], int | None]:
-    """Channels and number of ticks by the summary at the end of the file; none if it is missing or damaged."""
+def _index(file: IO[bytes], size: int) -> _Index:
+    """The summary at the end of the file."""
     file.seek(0)
     try:
         summary = SeekingReader(file, record_size_limit=size).get_summary()
     except Exception:
-        return (), None
+        return _Index()
     if summary is None or summary.statistics is None:
-        return (), None
+        return _Index()
     channels = tuple(summary.channels.values())
     counts = summary.statistics.channel_message_counts
-    return channels, sum(counts.get(channel.id, 0) for channel in channels if channel.topic == schemas.TICK_TOPIC)
+    ticks = sum(counts.get(channel.id, 0) for channel in channels if channel.topic == schemas.TICK_TOPIC)
+    starts = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+    starts += [attachment.offset for attachment in summary.attachment_indexes]
+    starts += [metadata.offset for metadata in summary.metadata_indexes]
+    return _Index(channels, ticks, tuple(sorted(starts)))

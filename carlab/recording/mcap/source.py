@@ -188,7 +188,9 @@ class _Collector:
 
     def recording(self, path: Path, defect: FileDefect | None) -> Recording:
         ours = self._library.startswith("carlab ")
-        if not ours and (defect is None or self._topics):
+        # The library of a damaged header is unknown; the topics show whose file it is.
+        is_foreign = defect is None or self._library or not schemas.TOPIC_CLASSES.keys() >= {*self._topics.values()}
+        if not ours and is_foreign:
             raise DataError(
                 f"{path} is an MCAP file but not a recording of carlab (written by "
                 f"{self._library or 'an unknown program'}); export it as CSV there and use carlab import."
