@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 FILE_NAME = "compare.json"
 
 
+_NEEDS_TWO_GROUPS = (
+    "A comparison needs two groups; name the first one before --with, which takes all names after it, for example "
+    "carlab compare monday.mcap --with friday.mcap."
+)
+
+
 def compare(
     recordings: RecordingLike | Iterable[RecordingLike],
     changed: RecordingLike | Iterable[RecordingLike],
@@ -57,7 +63,7 @@ def compare(
     file = load_car(car)
     first, second = as_list(recordings), as_list(changed)
     if not first or not second:
-        raise ConfigError("A comparison needs two groups, for example carlab compare monday.mcap --with friday.mcap.")
+        raise ConfigError(_NEEDS_TWO_GROUPS)
     first, second = recordings_of_runs(first, second)
     known = [c.id for c in change_candidates(file.simulator)]
     candidates = (candidates,) if isinstance(candidates, str) else candidates

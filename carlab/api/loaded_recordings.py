@@ -60,7 +60,10 @@ def assigned(
 ) -> tuple[list[RecordingSource], list[RecordingSource]]:
     """Recordings to fit and to hold out, with run folders resolved. Raises ConfigError if one is both."""
     if not recordings:
-        raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
+        raise ConfigError(
+            "Name at least one recording to fit, before --held-out, which takes all names after it, for example carlab "
+            "diagnose drive.mcap --held-out other.mcap."
+        )
     to_fit: list[RecordingSource] = []
     to_validate = list(held_out)
     for item in recordings:

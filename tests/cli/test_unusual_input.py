@@ -123,3 +123,12 @@ def test_second_interrupt_ends_a_search_at_once(
     monkeypatch.setattr(f"carlab.cli.{verb}.{verb}", interrupted_twice)
     other = ("--with", "b.csv") if verb == "compare" else ()
     assert carlab(verb, "a.csv", *other, "--out", tmp_path / "out") == (130, "carlab: Interrupted.")
+
+
+@pytest.mark.parametrize(("verb", "option"), [("diagnose", "--held-out"), ("compare", "--with")])
+def test_recording_behind_an_option_that_takes_it_is_asked_for_before_the_option(
+    carlab: Carlab, verb: str, option: str
+) -> None:
+    code, text = carlab(verb, option, "a.csv", "b.csv")
+    assert code == 2
+    assert f"before {option}, which takes all names after it" in text
