@@ -93,6 +93,13 @@ def test_small_share_of_a_large_excess_is_stated_as_an_error_above_the_noise() -
     assert "above the noise" not in verdict_sentence(near)
 
 
+def test_page_explains_the_symbols_of_a_formula() -> None:
+    formula = replace(REST, formula="F_rear/m += -0.785 w")
+    shown = page(replace(diagnosis("unexplained", 13.2), unexplained=formula))
+    assert "SI units. w: lateral velocity vy; F_rear/m: side force of the rear axle over the mass." in shown
+    assert "SI units. " not in page(diagnosis("unexplained", 13.2))
+
+
 def test_page_states_the_next_command_once() -> None:
     assert page(diagnosis("unexplained", 13.2)).count("carlab drive --policy coast_down") == 1
 

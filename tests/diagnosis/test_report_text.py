@@ -22,7 +22,7 @@ from carlab.diagnosis.findings import (
 )
 from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
-from carlab.diagnosis.report.residual import explained_share
+from carlab.diagnosis.report.residual import explained_share, formula_symbols
 from carlab.diagnosis.report.sentences import (
     confidence_text,
     effect_sentence,
@@ -356,3 +356,16 @@ def test_terms_of_a_class_are_numbered() -> None:
     one, two = (f"{c.term.statement}; acts on {name}" for c, name in zip(terms, ("vx", "vy"), strict=True))
     assert ResidualModel((terms[0],)).class_statement() == one
     assert ResidualModel(tuple(terms)).class_statement() == f"(1) {one}; (2) {two}"
+
+
+def test_each_symbol_of_a_formula_has_its_meaning() -> None:
+    """All terms of the library on all channels; functions, pi, yaw, dt and the unit m need no explanation."""
+    plain = {"sin", "cos", "sign", "pi", "yaw", "m", "dt", "dvx", "dvy"}
+    for term in TERMS:
+        for channel in range(5):
+            formula = ResidualModel((ChosenTerm(term, channel, 1.0, 1.0),)).formula()
+            symbols = " ".join(entry.split(": ")[0] for entry in formula_symbols(formula).split("; "))
+            words = set(re.findall(r"F_\w+/m|[a-z]+", formula)) - plain
+            assert {{"dr": "r", "du": "u", "dd": "d"}.get(word, word) for word in words} == set(symbols.split())
+    assert formula_symbols("dvx/dt += -0.3 du/dt") == "u: throttle in [-1, 1] after the delays of the car file"
+    assert formula_symbols("wind: speed 2 m/s") == ""

@@ -15,7 +15,7 @@ from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve
 from carlab.diagnosis.report.drift import drift_sentences
 from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
-from carlab.diagnosis.report.residual import explained_share, relevant_residual, shown_errors
+from carlab.diagnosis.report.residual import explained_share, formula_symbols, relevant_residual, shown_errors
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import EVIDENCE, REPORT
 
@@ -70,6 +70,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "event_sentences": diagnosed_event_sentences(diagnosis),
         "rest": rest,
         "rest_where": text.listed([text.CHANNEL_NAMES.get(c, c) for c in rest.channels]) if rest else "",
+        "rest_symbols": formula_symbols(rest.formula) if rest else "",
         "rest_regime": text.regime_clause(rest.regime) if rest else "",
         "drive": command,
         "drive_name": drive,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, final_model_name
 from carlab.diagnosis.settings import EVIDENCE, REPORT
@@ -50,3 +51,31 @@ def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
     if diagnosis.verdict in ("none", "parameters") and not is_above_noise(diagnosis, "refit"):
         return None
     return rest
+
+
+SYMBOLS = {
+    "v": "longitudinal velocity vx",
+    "w": "lateral velocity vy",
+    "r": "yaw rate",
+    "u": "throttle in [-1, 1] after the delays of the car file",
+    "d": "steering in [-1, 1] after the delays of the car file",
+    "before": "0.3 s earlier",
+    "x": "position x",
+    "y": "position y",
+    "t": "time as a share of the recording",
+    "s": "distance travelled",
+    "grip work": "mean lateral acceleration before the prediction, over 3 m/s²",
+    "F_front/m": "side force of the front axle over the mass",
+    "F_rear/m": "side force of the rear axle over the mass",
+}
+"""Meaning of the symbols in formulas of missing accelerations."""
+_RATES = {"dr": "r", "du": "u", "dd": "d"}
+
+
+def formula_symbols(formula: str) -> str:
+    """List the symbols of a formula of missing accelerations with their meanings; empty for another description."""
+    if "+=" not in formula:
+        return ""
+    words = re.findall(r"F_front/m|F_rear/m|grip work|[A-Za-z]+", formula)
+    used = {_RATES.get(word, word) for word in words}
+    return "; ".join(f"{symbol}: {meaning}" for symbol, meaning in SYMBOLS.items() if symbol in used)
