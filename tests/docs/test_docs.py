@@ -25,6 +25,7 @@ from carlab.experiment.episodes.result import EpisodeResult
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from mocap.config import MocapConfig
+from sim_backends.car_parameters import preset_names
 from sim_backends.effects import CATALOGUE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -230,6 +231,20 @@ def test_links_between_files_of_the_repository_resolve() -> None:
 def test_each_effect_of_the_catalogue_has_a_picture() -> None:
     drawn = {path.stem for path in (ROOT / "docs" / "images" / "effects").glob("*.png")}
     assert drawn == set(CATALOGUE), "run make pictures"
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/glossary.md", "docs/reference/effects.md", "docs/explanation/proof-protocol.md"]
+)
+def test_number_of_effects_is_that_of_the_catalogue(page: str) -> None:
+    numbers = re.findall(r"\b(\d\d) effects", (ROOT / page).read_text(encoding="utf-8"))
+    assert set(numbers) == {str(len(CATALOGUE))}
+
+
+@pytest.mark.parametrize("page", ["docs/glossary.md", "docs/reference/car-file.md"])
+def test_cars_that_come_with_carlab_are_listed(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert [name for name in preset_names() if f"`{name}`" not in text] == []
 
 
 def test_site_builds_without_warnings(tmp_path: Path) -> None:
