@@ -336,6 +336,11 @@ def missing_columns(mapping: ColumnMapping, header: Sequence[str]) -> list[str]:
     return lacking + [name for name in named if name not in header]
 
 
+def _n_present(mapping: ColumnMapping, header: Sequence[str]) -> int:
+    """Number of columns of ``mapping`` in ``header``."""
+    return sum(source.name in header for source in mapping.columns.values())
+
+
 def recognise_layout(header: Sequence[str], where: str, rate_hz: float | None = None) -> ColumnMapping:
     """The preset whose columns ``header`` holds; with a row rate [Hz], the time column may be missing.
 
@@ -346,9 +351,9 @@ def recognise_layout(header: Sequence[str], where: str, rate_hz: float | None = 
         particular = [preset.columns[c].name for c in ("vx", "vy") if preset is ETH]
         if not missing_columns(mapping, header) and all(name in header for name in particular):
             return preset if rate_hz is None else mapping
-    nearest = min(presets, key=lambda mapping: len(missing_columns(mapping, header)))
+    nearest = min(presets, key=lambda mapping: (len(missing_columns(mapping, header)), -_n_present(mapping, header)))
     lacking = missing_columns(nearest, header)
-    names = [nearest.columns[c].name for c in nearest.columns]
+    names = [source.name for source in nearest.columns.values()]
     spare = [name for name in header if name not in names]
     near = difflib.get_close_matches(lacking[0].split(" (")[0], spare, n=1, cutoff=0.4)
     hint = f" (is it '{near[0]}'?)" if near else ""

@@ -118,6 +118,14 @@ def test_quaternion_instead_of_yaw_has_the_formula_as_remedy(name):
         recognise_layout(header, "drive.csv")
 
 
+@pytest.mark.parametrize("channel", ["x", "y", "yaw"])
+def test_column_of_another_channel_is_not_proposed_for_a_missing_one(channel):
+    header = [name for name in CANONICAL.columns if name != channel]
+    with pytest.raises(DataError) as error:
+        recognise_layout(header, "drive.csv")
+    assert f"has no column {channel}; " in str(error.value)
+
+
 def test_other_columns_are_no_quaternion():
     with pytest.raises(DataError) as error:
         recognise_layout(["t", "x", "y", "view", "raw", "steering", "throttle"], "drive.csv")
