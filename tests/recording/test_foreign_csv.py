@@ -55,6 +55,16 @@ class TestConversion:
             import_csv(foreign.write(tmp_path / "commas.csv", clean)).episode.states,
         )
 
+    def test_unpacked_file_with_the_name_of_a_packed_one_is_read(self, clean, tmp_path):
+        """Browsers unpack some downloads and keep their names."""
+        path = foreign.write(tmp_path / "run.csv", clean)
+        plain = import_csv(path).episode.states
+        unpacked = path.rename(tmp_path / "run.csv.gz")
+        np.testing.assert_array_equal(import_csv(unpacked).episode.states, plain)
+        unpacked.write_bytes(b"\x1f\xff" + bytes(100))
+        with pytest.raises(DataError, match=r"run\.csv\.gz is neither a gzip file nor text in UTF-8; copy it again"):
+            import_csv(unpacked)
+
     def test_rows_in_reverse_order_are_to_be_sorted_not_left_out(self, clean, tmp_path):
         path = foreign.write(tmp_path / "run.csv", {name: column[::-1] for name, column in clean.items()})
         with pytest.raises(DataError, match=r"sort the rows by time .--stamps drop would leave out 899 of 900 rows"):

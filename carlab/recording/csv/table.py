@@ -141,12 +141,14 @@ def _without_comments(text: str) -> str:
 def _read_text(path: Path) -> str:
     try:
         content = path.read_bytes()
-        if path.suffix == ".gz" or content[:2] == b"\x1f\x8b":
+        if content[:2] == b"\x1f\x8b":  # The name does not matter: a browser may unpack a .gz file and keep its name.
             content = gzip.decompress(content)
         return content.decode("utf-8-sig")
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{path.name} is not a complete gzip file ({error}); copy it again.") from error
     except UnicodeDecodeError as error:
+        if path.suffix == ".gz":
+            raise DataError(f"{path.name} is neither a gzip file nor text in UTF-8; copy it again.") from error
         raise DataError(
             f"{path.name} is not a text file: byte {error.start} is not UTF-8; save it as CSV in UTF-8."
         ) from error
