@@ -76,6 +76,7 @@ class Diagnose:
         from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences, curves_advice
         from carlab.diagnosis.report.drift import drift_sentences
         from carlab.diagnosis.report.events import diagnosed_event_sentences
+        from carlab.diagnosis.report.numbers import percent
         from carlab.diagnosis.report.residual import shown_errors
 
         others = [fault for fault in diagnosis.data_faults if fault.id != INCOMPLETE_FILE]
@@ -87,7 +88,9 @@ class Diagnose:
         sentences += [ceiling_sentence(diagnosis), *drift_sentences(diagnosis), *diagnosed_event_sentences(diagnosis)]
         for sentence in filter(None, sentences):
             console.print(f"  {sentence}")
-        print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", shown_errors(diagnosis))
+        share = diagnosis.held_out_share
+        part = "" if share is None else f" in the last {percent(share)} of each recording, which no fit uses"
+        print_errors(f"Error after {diagnosis.horizon_s:.1f} s{part}", "held out", shown_errors(diagnosis))
         if not self.curves and (advice := curves_advice(diagnosis)):
             console.print(advice)
         console.print(

@@ -130,6 +130,8 @@ def diagnose(
         recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
         scored, naming = _search_effects(recordings, noise, request, control, timer)
         outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
+    diagnosis = replace(outcome.diagnosis, held_out_share=None if held_out else share)
+    outcome = replace(outcome, diagnosis=diagnosis)
     return _with_run(outcome, timer, effects or (), decisions)
 
 

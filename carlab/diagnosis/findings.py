@@ -258,7 +258,8 @@ class Diagnosis:
     the residual also with_uncatalogued_physics, with measured curves also with_curves, with a ceiling also black_box,
     with a discrepancy also with_discrepancy. ``held_out_with_events`` has the same models, scored with the windows that
     events left out; empty without such windows. ``fitted_score`` is that of with_effects on the windows that were
-    fitted; NaN if unknown. ``car_file_parameters`` has the value of each of the ``parameters`` in
+    fitted; NaN if unknown. ``held_out_share`` is the share of the last part of each recording that is held out; None if
+    whole recordings are. ``car_file_parameters`` has the value of each of the ``parameters`` in
     the car file, if it states one. ``limits`` has estimates of the effects that are not named, by effect and
     parameter. ``curve_trial`` is None without measured curves as a stage, and if the user ended it.
     """
@@ -286,6 +287,7 @@ class Diagnosis:
     search: SearchExtent = field(default_factory=SearchExtent)
     events: EventUse = field(default_factory=EventUse)
     held_out_with_events: Mapping[str, FitErrors] = field(default_factory=dict)
+    held_out_share: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
@@ -316,6 +318,7 @@ class Diagnosis:
             "fit": {
                 "horizon_s": self.horizon_s,
                 "fitted_score": self.fitted_score,
+                "held_out_share": self.held_out_share,
                 "held_out": {k: asdict(v) for k, v in self.held_out.items()},
             },
             "unexplained": unexplained,

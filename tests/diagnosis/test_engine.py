@@ -13,6 +13,7 @@ import carlab
 from carlab.benchmark.cases.case import make_case
 from carlab.benchmark.proof.calibration import passes
 from carlab.cli import run
+from carlab.cli.diagnose import Diagnose
 from tests.helpers.case_files import write_case
 
 
@@ -41,6 +42,8 @@ def test_concealed_servo_lag_is_named_first_and_estimated(concealed: tuple[Path,
     assert first["id"] == "steering_lag"
     assert first["parameters"]["time_constant"]["value"] == pytest.approx(concealed[1], rel=0.05)
     held_out = report["fit"]["held_out"]
+    assert report["fit"]["held_out_share"] is None
+    assert "is held out: no fit uses it" not in (diagnosed / "report.html").read_text()
     assert held_out["with_effects"]["score"] < 0.5 * held_out["refit"]["score"]
     assert held_out["constant_velocity"]["score"] > held_out["refit"]["score"]
     for name in ("report.html", "report.rrd", "model.toml"):
@@ -98,6 +101,10 @@ def test_replay_scores_the_held_out_share_of_a_diagnosis(
 ) -> None:
     fit, car = concealed[0] / "fit.csv", str(concealed[0] / "car.toml")
     report = carlab.diagnose(fit, car, stop=lambda: True)
+    assert report.to_dict()["fit"]["held_out_share"] == 0.3
+    assert "The last 30 % of each recording is held out: no fit uses it." in report.to_html()
+    Diagnose((fit,))._print(report.diagnosis)
+    assert "Error after 1.0 s in the last 30 % of each recording, which no fit uses" in capfd.readouterr().out
     rows = replayed(fit, car, "last 30 %", capfd)
     assert_agree(rows["model"], asdict(report.held_out["nominal"]))
     assert_agree(rows["constant velocity"], asdict(report.held_out["constant_velocity"]))
