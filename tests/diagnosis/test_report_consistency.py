@@ -93,6 +93,12 @@ def test_small_share_of_a_large_excess_is_stated_as_an_error_above_the_noise() -
     assert "above the noise" not in verdict_sentence(near)
 
 
+def test_confidence_of_a_name_is_a_probability_below_one() -> None:
+    certain = replace(lag_finding(), indistinguishable_from=(), confidence=0.9999975)
+    shown = page(replace(diagnosis("mismatch", 8.0, with_effects=1.1), effects=(certain,)))
+    assert "almost certain (probability of the name: more than 99 %)" in shown
+
+
 def test_page_explains_the_symbols_of_a_formula() -> None:
     formula = replace(REST, formula="F_rear/m += -0.785 w")
     shown = page(replace(diagnosis("unexplained", 13.2), unexplained=formula))
