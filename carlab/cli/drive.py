@@ -11,13 +11,14 @@ from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
 from carlab.api.drive_run import DriveRun
-from carlab.api.driving import drive
+from carlab.api.driving import EXCITATION, drive
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
 from carlab.core.documents import Tick
+from carlab.core.manoeuvres import MANOEUVRES
 from carlab.core.outcome import EndReason
 from carlab.experiment.episodes.hooks import RunHooks
 
@@ -75,23 +76,27 @@ class Drive:
 
         return RunHooks(**common_hooks(bar), on_episode=on_episode, on_tick=on_tick)
 
+    def _has_task(self) -> bool:
+        """Whether the figures of a task say something: a manoeuvre does not try to park."""
+        return self.task.task is not None or self.policy not in (EXCITATION, "neutral", *MANOEUVRES)
+
     def _report(self, run: DriveRun) -> int:
         results = run.episodes
         if not results:
             console.print("No episode was driven.")
             return EXIT_INTERRUPTED
-        names = figure_names(results)
+        names = figure_names(results) if self._has_task() else []
         rows = [
             [
                 str(r.episode),
                 str(r.data.ticks),
-                f"{r.total_reward:.1f}",
+                *([f"{r.total_reward:.1f}"] if names else []),
                 *(figure_text(name, r.summary.get(name, math.nan)) for name in names),
                 r.reason.name.lower().replace("_", " "),
             ]
             for r in results
         ]
-        table("", ["episode", "ticks", "return", *(heading(n) for n in names), "end"], rows)
+        table("", ["episode", "ticks", *(["return"] if names else []), *(heading(n) for n in names), "end"], rows)
         for r in results:
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())

@@ -291,3 +291,21 @@ def test_track_of_the_car_file_is_driven(carlab: Carlab, tmp_path: Path) -> None
     (folder,) = (tmp_path / "runs").iterdir()
     path = json.loads(read_episode(folder / "episodes" / "0001.mcap").metadata["path_m"])
     np.testing.assert_allclose(path, points)
+
+
+@pytest.mark.parametrize(
+    ("options", "is_scored"),
+    [
+        (("--policy", "slow_circle"), False),
+        (("--policy", "excitation"), False),
+        (("--policy", "slow_circle", "--task", "parking"), True),
+        ((), True),
+    ],
+)
+def test_drive_without_a_task_has_no_figures_of_parking(
+    carlab: Carlab, tmp_path: Path, options: tuple[str, ...], is_scored: bool
+) -> None:
+    code, text = carlab("drive", *options, "--ticks", "5", "--out", tmp_path, "--no-rerun", "--no-picture")
+    assert code == 0, text
+    assert "episode ticks" in text
+    assert all((word in text) == is_scored for word in ("return", "success", "distance"))
