@@ -130,16 +130,21 @@ def diagnose(
         recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
         scored, naming = _search_effects(recordings, noise, request, control, timer)
         outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
-    diagnosis = replace(outcome.diagnosis, held_out_share=None if held_out else share)
-    outcome = replace(outcome, diagnosis=diagnosis)
-    return _with_run(outcome, timer, effects or (), decisions)
+    return _with_run(outcome, timer, effects or (), None if held_out else share, decisions)
 
 
-def _with_run(outcome: Outcome, timer: SearchTimer, effects: Sequence[str], decisions: Sequence[Decision]) -> Outcome:
-    """The outcome with texts, run time, and extent and decisions of the search among ``effects`` (empty: all)."""
+def _with_run(
+    outcome: Outcome,
+    timer: SearchTimer,
+    effects: Sequence[str],
+    held_out_share: float | None,
+    decisions: Sequence[Decision],
+) -> Outcome:
+    """The outcome with texts, run time, held-out share, and extent and decisions of the search among ``effects``."""
     extent = replace(timer.extent(), effects=tuple(effects))
-    diagnosis = with_texts(replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent))
-    return replace(outcome, diagnosis=diagnosis, figure_data=replace(outcome.figure_data, decisions=tuple(decisions)))
+    diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=extent, held_out_share=held_out_share)
+    figure_data = replace(outcome.figure_data, decisions=tuple(decisions))
+    return replace(outcome, diagnosis=with_texts(diagnosis), figure_data=figure_data)
 
 
 def _prepare_recordings(
