@@ -101,7 +101,7 @@ class ThrottleAsymmetry(ActuatorEffect):
     sentence = "in reverse, the motor has {gain_ratio} times the force that it has forwards at the same throttle"
     refuted_if = "the car is as fast backwards as forwards at the same throttle"
     command = "throttle"
-    order = 30
+    order = 25
     parameters = (EffectParameter("gain_ratio", "1", 1.0, 0.0, 10.0, 1.5),)
     confusable = (
         Confusable(

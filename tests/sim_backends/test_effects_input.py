@@ -137,6 +137,23 @@ def test_effects_act_in_the_documented_order():
     assert np.allclose(found, np.maximum(servo - 0.05, 0.0), atol=2e-3)
 
 
+def test_static_throttle_effects_act_before_the_lag_of_the_motor():
+    """Throttle: dead band, nonlinearity, asymmetry, lag."""
+    numbers = {
+        "motor_lag": {"time_constant": 0.1},
+        "throttle_asymmetry": {"gain_ratio": 0.5},
+        "throttle_nonlinearity": {"exponent": 2.0},
+        "throttle_deadband": {"width": 0.2},
+    }
+    one = chain(numbers)
+    memory = one.settled((0.0, 0.0))
+    motor = 0.0
+    for command, static in [(0.6, 0.25)] * 30 + [(-0.6, -0.125)] * 10:
+        (_, signal), memory = one.step((0.0, command), memory, 0.01)
+        motor = static + (motor - static) * math.exp(-0.1)  # closed form of the lag over 0.01 s
+        assert signal[2] == pytest.approx(motor, abs=1e-12)
+
+
 def test_throttle_delay_moves_the_drive_alone():
     """After a step of both commands the car steers at the same time and accelerates later by the delay."""
     period_s = 0.01
