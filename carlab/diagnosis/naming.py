@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.curves.curve_rival import curve_in_addition, replacing_curve
+from carlab.diagnosis.curves.curve_rival import RIVAL_CURVES, curve_in_addition, replacing_curve
 from carlab.diagnosis.decisions import Alternatives, Condition
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.fit import Fit
@@ -27,7 +27,6 @@ from carlab.diagnosis.selection.search import restrict
 from carlab.diagnosis.unexplained.description import ResidualModel, describe, fit_residual_terms, start_features
 from carlab.diagnosis.unexplained.vibration import Vibration
 from carlab.diagnosis.weak_effects import without_harmful_effects, without_negligible_effects
-from sim_backends.effects.curves import SteeringCurve
 
 log = logging.getLogger(__name__)
 
@@ -123,9 +122,9 @@ def _rival_without_names(
     if rival is not None and not rival.names:
         return rival
     additional = additional_physics(problem, found, control)
-    if rival is None or rival.effect != SteeringCurve.id:
+    if rival is None or rival.effect not in RIVAL_CURVES:
         return additional
-    curve = curve_in_addition(problem, found, ())
+    curve = curve_in_addition(problem, found, rival.effect, ())
     return curve if additional is None or curve.gain > additional.gain else additional
 
 

@@ -140,8 +140,8 @@ class Effect:
     catalogued: ClassVar[bool] = True
     """Whether a diagnosis may name the effect; otherwise it is rival physics, described by ``class_statement``."""
     class_statement: ClassVar[str] = ""
-    represented_by: ClassVar[str] = ""
-    """Id of the measured curve that contains the effect; a fit of that curve omits the effect."""
+    represented_by: ClassVar[tuple[str, ...]] = ()
+    """Ids of measured curves that contain the effect; a fit of such a curve omits the effect."""
     fitted_with_curves: ClassVar[bool] = False
     """Whether a fit of measured curves always includes the effect: timing and mounting, which no curve represents."""
 

@@ -39,7 +39,7 @@ class CombinedSlip(DynamicsEffect):
     """
 
     id = "combined_slip"
-    represented_by = "rear_tyre_map"
+    represented_by = ("rear_tyre_map",)
     command = "throttle"
     name = "driven wheels that spin and lock, with less side force"
     summary = "Driven wheels spin or lock: their tyres transmit limited force, and lose side force while they slip."

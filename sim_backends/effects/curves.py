@@ -246,6 +246,37 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
         forces.drive = forces.drive + forces.mass * added
 
 
+class ThrottleCurve(MeasuredCurve, ActuatorEffect):
+    """``u = u_t + a(u_t)``: the throttle at the motor over its command.
+
+    The drive map contains this curve. It has few deviations, so each diagnosis can afford its fit.
+    """
+
+    id = "throttle_curve"
+    represented_by = (DriveMap.id,)
+    quantity = "throttle at the motor"
+    summary = "The throttle at the motor is a measured curve over its command."
+    class_statement = "a map of the throttle command: the motor's throttle is a curve over it"
+    command = "throttle"
+    order = 28
+    unit, typical, bound = "1", 0.1, 2.0
+    axes = (
+        Axis("commanded throttle", "1", (-1.0, -0.6, -0.35, -0.2, -0.1, 0.0, 0.1, 0.2, 0.35, 0.6, 1.0), anchor=0.0),
+    )
+
+    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
+        """The throttle [1]."""
+        return (forces.throttle,)
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """The command itself [1]."""
+        return np.asarray(coordinates[0])
+
+    def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
+        """Add the deviation to the command."""
+        return command + self.deviation(ops, (command,), values)
+
+
 class SteeringCurve(MeasuredCurve, ActuatorEffect):
     """``d = d_cmd + a(d_cmd)`` with the wheel angle ``d_cmd = max_angle command`` of the base model."""
 
@@ -351,4 +382,4 @@ class RearTyreMap(_SideForceMap):
         forces.side_rear = forces.side_rear + forces.load_rear * self.added(ops, forces, values)
 
 
-CURVES = (DriveMap(), SteeringCurve(), FrontTyreMap(), RearTyreMap())
+CURVES = (DriveMap(), ThrottleCurve(), SteeringCurve(), FrontTyreMap(), RearTyreMap())

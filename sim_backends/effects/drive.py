@@ -59,7 +59,7 @@ class BrakeAsymmetry(DynamicsEffect):
     """``drive force * gain_ratio`` where drive force and vx have opposite signs."""
 
     id = "brake_asymmetry"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "a brake gain that differs from the drive gain"
     summary = "The motor's gain differs between braking and driving."
@@ -95,7 +95,7 @@ class DragBrake(DynamicsEffect):
     """
 
     id = "drag_brake"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "a drag brake with the throttle released"
     summary = "The motor brakes while the throttle is released."
@@ -145,7 +145,7 @@ class MotorSaturation(DynamicsEffect):
     """
 
     id = "motor_saturation"
-    represented_by = "drive_map"
+    represented_by = ("drive_map", "throttle_curve")
     command = "throttle"
     name = "a limit of the motor's force"
     summary = "The motor's drive force is limited."
@@ -183,7 +183,7 @@ class SpeedController(DynamicsEffect):
     """
 
     id = "speed_controller"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "a controller that holds a speed, with limited force"
     summary = "The motor controller holds the speed that the throttle demands, with limited force."
@@ -276,7 +276,7 @@ class TractionLimit(DynamicsEffect):
     """
 
     id = "traction_limit"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "a limit of traction"
     summary = "The force of the driven wheels is limited by their grip."

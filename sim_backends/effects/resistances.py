@@ -13,7 +13,7 @@ class RollingResistance(DynamicsEffect):
     """``F_x -= force tanh(vx / 0.05 m/s)``."""
 
     id = "rolling_resistance"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "rolling resistance"
     summary = "Rolling resistance: a force against the motion that does not depend on speed."
@@ -30,7 +30,7 @@ class AerodynamicDrag(DynamicsEffect):
     """``F_x -= coefficient vx |vx|``."""
 
     id = "aerodynamic_drag"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "a drag that grows with the square of speed"
     summary = "Aerodynamic drag: a force against the motion that grows with the square of speed."

@@ -21,7 +21,7 @@ class SteeringDeadband(ActuatorEffect):
     """``d = d_cmd - clip(d_cmd, -width/2, width/2)``."""
 
     id = "steering_deadband"
-    represented_by = "steering_curve"
+    represented_by = ("steering_curve",)
     name = "a dead band of the steering"
     summary = "The steering servo ignores small commands around straight ahead."
     sentence = "the steering ignores small commands around straight ahead, in a band {width} wide"
@@ -121,7 +121,7 @@ class SteeringAsymmetry(ActuatorEffect):
     """``d = d_cmd (1 + gain sign(d_cmd))``."""
 
     id = "steering_asymmetry"
-    represented_by = "steering_curve"
+    represented_by = ("steering_curve",)
     name = "an asymmetry of the steering"
     summary = "The wheels turn farther to one side than to the other."
     sentence = (
@@ -149,7 +149,7 @@ class SteeringNonlinearity(ActuatorEffect):
     """``d = saturation tanh(d_cmd / saturation)``."""
 
     id = "steering_nonlinearity"
-    represented_by = "steering_curve"
+    represented_by = ("steering_curve",)
     name = "a nonlinearity of the steering towards full lock"
     summary = "The wheel angle grows less than the command towards full lock."
     sentence = "the wheel angle grows less than in proportion to its command and stays below {saturation}"

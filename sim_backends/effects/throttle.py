@@ -18,7 +18,7 @@ class ThrottleDeadband(ActuatorEffect):
     """``u = sign(u_t) max(|u_t| - width, 0) / (1 - width)``."""
 
     id = "throttle_deadband"
-    represented_by = "drive_map"
+    represented_by = ("drive_map", "throttle_curve")
     name = "a dead band of the throttle"
     summary = "The motor does not respond to small throttle commands."
     sentence = "the motor does not respond to throttle commands smaller than {width:percent} of full"
@@ -49,7 +49,7 @@ class ThrottleNonlinearity(ActuatorEffect):
     """
 
     id = "throttle_nonlinearity"
-    represented_by = "drive_map"
+    represented_by = ("drive_map", "throttle_curve")
     name = "a curved throttle response"
     summary = "The motor's force is not proportional to the throttle command."
     sentence = (
@@ -95,7 +95,7 @@ class ThrottleAsymmetry(ActuatorEffect):
     """``u = gain_ratio u_t`` for a negative throttle ``u_t``; motor controllers have such a setting for reverse."""
 
     id = "throttle_asymmetry"
-    represented_by = "drive_map"
+    represented_by = ("drive_map", "throttle_curve")
     name = "a gain in reverse that differs from the forward gain"
     summary = "The motor's gain differs between forward and reverse throttle."
     sentence = "in reverse, the motor has {gain_ratio} times the force that it has forwards at the same throttle"

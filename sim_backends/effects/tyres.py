@@ -93,7 +93,7 @@ class FrontWheelPlay(DynamicsEffect):
     """
 
     id = "front_wheel_play"
-    represented_by = "front_tyre_map"
+    represented_by = ("front_tyre_map",)
     name = "play of the front wheels"
     summary = "The side force turns the front wheels within the play of their linkage."
     sentence = "the side force turns the front wheels by {angle} against the steering, within the play of their linkage"
@@ -183,7 +183,7 @@ class FrictionEllipse(DynamicsEffect):
     """
 
     id = "friction_ellipse"
-    represented_by = "rear_tyre_map"
+    represented_by = ("rear_tyre_map",)
     name = "grip shared between driving and cornering"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (

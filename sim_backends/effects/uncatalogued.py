@@ -151,7 +151,7 @@ class CoastBrake(DynamicsEffect):
     """``F_x -= coefficient vx exp(-(u / 0.05)^2)``: a speed controller that brakes while the throttle is released."""
 
     id = "coast_brake"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     catalogued = False
     summary = "The motor brakes while the throttle is released."
     class_statement = "odd in speed where there is no throttle, as with a motor that brakes while the car coasts"

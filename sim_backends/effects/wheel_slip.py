@@ -42,7 +42,7 @@ class LongitudinalSlip(DynamicsEffect):
     """
 
     id = "longitudinal_slip"
-    represented_by = "drive_map"
+    represented_by = ("drive_map",)
     command = "throttle"
     name = "slipping driven wheels"
     summary = "The driven wheels slip: they accelerate before the car does, and transmit at most their grip."

@@ -183,8 +183,9 @@ def test_screening_moves_stated_numbers_to_both_sides(
 def test_stated_effect_that_a_curve_contains_is_omitted(nominal: SimulatorConfig, windows: PredictionWindows) -> None:
     stated = {"throttle_deadband": {"width": 0.05}, MISALIGNMENT: {"angle": 0.02}}
     problem = SearchProblem(replace(nominal, effects=stated), windows, np.ones(6), np.ones(6), {})
-    assert EFFECTS["throttle_deadband"].represented_by == "drive_map"
-    assert set(problem.config_with(("drive_map",)).effects) == {MISALIGNMENT, "drive_map"}
+    for curve in ("drive_map", "throttle_curve"):
+        assert curve in EFFECTS["throttle_deadband"].represented_by
+        assert set(problem.config_with((curve,)).effects) == {MISALIGNMENT, curve}
     assert problem.config_with(("aerodynamic_drag",)).effects.items() >= stated.items()
 
 

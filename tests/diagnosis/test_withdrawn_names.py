@@ -20,6 +20,7 @@ from tests.helpers.case_files import car_in, episodes_in, write_case
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
 """Half as many windows as by default. They overlap less, so they have nearly as much information."""
 STATIC = ("steering_deadband", "steering_asymmetry", "steering_nonlinearity", "steering_offset", "yaw_damping")
+STATIC_THROTTLE = ("throttle_deadband", "throttle_nonlinearity", "throttle_asymmetry", "motor_saturation")
 DYNAMIC = ("steering_lag", "steering_delay", "yaw_damping")
 
 
@@ -69,11 +70,34 @@ def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("effect", "form"), [("steering_deadband", "other"), ("steering_asymmetry", "catalogue")])
-def test_steering_effect_that_a_curve_contains_keeps_its_name(
+def test_throttle_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A random increasing map of the throttle resembles a gain in reverse, which all other checks accept."""
+    case = make_case("outside", 12, effects=("random_throttle_map",), excess=3.0, fit_s=60, hold_s=30)
+    outcome = found(case, tmp_path, STATIC_THROTTLE, monkeypatch)
+    assert [(d.effect, d.passed) for d in decisions_by(outcome, "rivals.curve_z_min")] == [
+        ("throttle_asymmetry", False)
+    ]
+    assert outcome.diagnosis.verdict == "unexplained"
+    assert outcome.diagnosis.effects == ()
+    assert outcome.diagnosis.unexplained is not None
+    assert "a map of the throttle command" in outcome.diagnosis.unexplained.kind
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "form"),
+    [
+        ("steering_deadband", "other"),
+        ("steering_asymmetry", "catalogue"),
+        ("throttle_deadband", "other"),
+        ("throttle_asymmetry", "catalogue"),
+    ],
+)
+def test_effect_that_a_curve_contains_keeps_its_name(
     effect: str, form: FormName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    outcome = found(made("single", effect, form), tmp_path, STATIC, monkeypatch)
+    candidates = STATIC if effect.startswith("steering") else STATIC_THROTTLE
+    outcome = found(made("single", effect, form), tmp_path, candidates, monkeypatch)
     assert [e.id for e in outcome.diagnosis.effects] == [effect]
     assert [(d.effect, d.passed) for d in decisions_by(outcome, "rivals.curve_z_min")] == [(effect, True)]
 

@@ -36,12 +36,13 @@ def fit_curves(
 ) -> tuple[CurveFit | None, tuple[RejectedCurves, ...]]:
     """Fit all applicable curves, and remove those that left-out blocks do not need.
 
-    Named effects that a curve contains are omitted. The fit begins on fewer windows, to save time.
+    Named effects, and curves, that a curve contains are omitted. The fit begins on fewer windows, to save time.
 
     Returns:
         The fit with the accepted curves, or None without any, and the rejected curves.
     """
-    curves = tuple(c.id for c in CURVES if is_applicable(problem.nominal, c.id) and c.id not in problem.nominal.effects)
+    free = (c for c in CURVES if is_applicable(problem.nominal, c.id) and c.id not in problem.nominal.effects)
+    curves = tuple(c.id for c in free if not c.represented_by)
     effects = _effects_with(problem, found, curves)
     settings = problem.settings.curves
     few = replace(problem, windows=problem.windows.thinned(settings.max_windows))
@@ -67,7 +68,7 @@ def fit_curves(
 
 def _effects_with(problem: SearchProblem, found: SearchResult, curves: tuple[str, ...]) -> tuple[str, ...]:
     """Accepted effects that no curve contains, and the effects that accompany every curve."""
-    accepted = [e for e in found.effects if EFFECTS[e].represented_by not in curves]
+    accepted = [e for e in found.effects if not set(EFFECTS[e].represented_by).intersection(curves)]
     added = [
         e.id
         for e in CATALOGUE.values()

@@ -76,7 +76,8 @@ class SearchProblem:
         """
         stated = self.nominal.effects
         config = replace(
-            self.nominal, effects={e: stated[e] for e in stated if EFFECTS[e].represented_by not in effects}
+            self.nominal,
+            effects={e: stated[e] for e in stated if not set(EFFECTS[e].represented_by).intersection(effects)},
         )
         for name in effects:
             config = with_effect(config, name)

@@ -198,9 +198,9 @@ class RivalSettings:
     min_explained_share: float = 0.5
     """Minimum share of the refit's excess that one or two effects explain: of the loss with free initial states, or of
     the held-out squared score. On development cases true effects explain more than half, spurious names less."""
-    curve_z_min: float = 3.0
-    """A steering curve replaces named steering effects that it contains if its loss on left-out blocks, with free
-    initial states, is lower by this [standard errors], and by ``min_curve_share`` (docs/decisions/0019)."""
+    curve_z_min: float = 2.0
+    """A measured curve of a command replaces named effects that it contains if its loss on left-out blocks, with free
+    initial states, is lower by this [standard errors], and by ``min_curve_share`` (docs/decisions/0019, 0051)."""
     min_curve_share: float = 0.1
     """Minimum of this fall, as a share of the fall from the refit to the curve. A curve that only follows a named
     effect gains almost nothing."""
