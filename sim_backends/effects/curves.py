@@ -246,7 +246,19 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
         forces.drive = forces.drive + forces.mass * added
 
 
-class ThrottleCurve(MeasuredCurve, ActuatorEffect):
+class _CommandCurve(MeasuredCurve, ActuatorEffect):
+    """``c + a(c)`` for a command c, which the base model does not change."""
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """The command itself."""
+        return np.asarray(coordinates[0])
+
+    def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
+        """Add the deviation to the command."""
+        return command + self.deviation(ops, (command,), values)
+
+
+class ThrottleCurve(_CommandCurve):
     """``u = u_t + a(u_t)``: the throttle at the motor over its command.
 
     The drive map contains this curve. It has few deviations, so each diagnosis can afford its fit.
@@ -268,16 +280,8 @@ class ThrottleCurve(MeasuredCurve, ActuatorEffect):
         """The throttle [1]."""
         return (forces.throttle,)
 
-    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
-        """The command itself [1]."""
-        return np.asarray(coordinates[0])
 
-    def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Add the deviation to the command."""
-        return command + self.deviation(ops, (command,), values)
-
-
-class SteeringCurve(MeasuredCurve, ActuatorEffect):
+class SteeringCurve(_CommandCurve):
     """``d = d_cmd + a(d_cmd)`` with the wheel angle ``d_cmd = max_angle command`` of the base model."""
 
     id = "steering_curve"
@@ -292,14 +296,6 @@ class SteeringCurve(MeasuredCurve, ActuatorEffect):
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
         """The commanded wheel angle [rad]."""
         return (forces.wheel_angle,)
-
-    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
-        """The commanded angle itself [rad]."""
-        return np.asarray(coordinates[0])
-
-    def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Add the deviation to the command."""
-        return command + self.deviation(ops, (command,), values)
 
 
 class _SideForceMap(MeasuredCurve, DynamicsEffect):
