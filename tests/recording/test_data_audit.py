@@ -49,6 +49,26 @@ def test_clean_recording_has_no_warning(clean, tmp_path):
     assert len(report.rows()) == len(report.findings)
 
 
+def test_pose_that_stands_still_is_a_warning(clean, tmp_path):
+    rng = np.random.default_rng(7)
+    at_rest = {name: rng.normal(0.0, 3e-4, len(UNEVEN)) for name in ("x", "y", "yaw")}
+    report = import_drive(tmp_path, {**clean, **at_rest}).report
+    (finding,) = report.of("standing_pose", "x, y, yaw")
+    assert finding.severity is Severity.WARNING
+    assert "in only 0 of 1196 rows" in finding.sentence
+    assert "check that x, y and yaw are those of the car" in finding.sentence
+    assert not report.of("too_little_motion")
+
+
+def test_straight_drive_is_no_standing_pose(clean, tmp_path):
+    straight = {"x": UNEVEN, "y": 0.0 * UNEVEN, "yaw": 0.0 * UNEVEN}
+    report = import_drive(tmp_path, {**clean, **straight}).report
+    (finding,) = report.of("too_little_motion")
+    assert finding.severity is Severity.INFO
+    assert finding.sentence.startswith("The car always moves in one direction: unit and sign of yaw")
+    assert not report.of("standing_pose")
+
+
 @pytest.mark.parametrize("rate_hz", [30, 100, 120])
 @pytest.mark.parametrize("count", range(1, 13))
 def test_rows_off_the_path_are_single_rows_or_left_to_the_jumps(rate_hz, count):

@@ -125,6 +125,8 @@ def _finding(fault: Fault, mapping: ColumnMapping) -> Finding:
     """A fault of columns, by their names. A unit that is not SI and not declared is an error."""
     if fault.id == "too_little_motion":
         return Finding.of_fault(fault, Severity.INFO)
+    if fault.id == "standing_pose":
+        return Finding.of_fault(fault, Severity.WARNING, "check that x, y and yaw are those of the car")
     alternative = " (or --x-unit m --y-unit m if it is so)" if fault.channel == "x, y" else ""
     if fault.option == "--yaw-sign -1":
         alternative = f" (or {mapping.combined('--y-sign -1')})"

@@ -37,12 +37,16 @@ def heading_faults(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Fa
     faults, unit_per_m = _length_unit(speed)
     moving = speed > LIMITS.heading_mps * unit_per_m
     course = np.arctan2(dy, dx)[moving]
-    if moving.sum() < 50 or abs(np.mean(np.exp(2j * course))) > 0.95:
+    n_moving = int(moving.sum())
+    if n_moving < 50 and n_moving < 0.5 * len(moving):
         observation = (
-            f"the car moves in only {int(moving.sum())} rows or always in one direction: unit and sign of yaw cannot "
-            "be checked"
+            f"the pose moves faster than {LIMITS.heading_mps:g} m/s in only {n_moving} of {len(moving)} rows, so "
+            "velocities and commands cannot be compared with it, and a diagnosis needs a drive"
         )
-        return [*faults, Fault("too_little_motion", "yaw", observation)]
+        return [*faults, Fault("standing_pose", "x, y, yaw", observation)]
+    if n_moving < 50 or abs(np.mean(np.exp(2j * course))) > 0.95:
+        why = f"the car moves in {n_moving} rows only" if n_moving < 50 else "the car always moves in one direction"
+        return [*faults, Fault("too_little_motion", "yaw", f"{why}: unit and sign of yaw cannot be checked")]
     path = _Course(course, values["yaw"][reach:-reach][moving], wrap(turn[moving]) / distance[moving])
     return faults + _yaw_faults(path)
 
