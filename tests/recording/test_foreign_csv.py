@@ -309,6 +309,15 @@ class TestRefusal:
         assert imported.episode.ticks == 897
         assert np.all(np.diff(imported.episode.times_s) > 0)
 
+    def test_constant_time_column_is_replaced_by_the_rate_of_the_rows(self, clean, tmp_path):
+        message = self.refuse(tmp_path, {**clean, "t": 0.0 * EVEN}, "899 of 900 stamps repeat", "--rate", "--mapping")
+        assert "--stamps drop" not in message
+        with pytest.raises(DataError, match="899 of 900 stamps repeat"):
+            import_csv(tmp_path / "run.csv", mapping=CANONICAL.with_options(stamps="drop"))
+        without_time = foreign.write(tmp_path / "rate.csv", {k: v for k, v in clean.items() if k != "t"})
+        imported = import_csv(without_time, mapping=CANONICAL.with_options(rate_hz=30.0))
+        assert imported.episode.ticks == 899
+
     def test_yaw_in_degrees_is_refused_or_converted(self, clean, tmp_path):
         columns = {**clean, "yaw": np.rad2deg(clean["yaw"])}
         self.refuse(tmp_path, columns, "'yaw'", "degrees", "--yaw-unit deg")

@@ -23,6 +23,8 @@ from carlab.recording.faults.robust import LAGS_S, correlation, fit_column
 from carlab.recording.faults.stamps import gap_rows
 from carlab.recording.pose_velocity import BoolArray, IndexArray
 
+MIN_ROWS = 3
+"""Minimum number of rows of a recording."""
 MAX_NUMBER = 1e12
 """Larger numbers in SI units are markers of missing values or corrupt data."""
 MAX_STAMP = 1e20
@@ -104,6 +106,12 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
     repeated, back = int(np.sum(step == 0)), int(np.sum(step < 0))
     k = int(np.flatnonzero(step <= 0)[0])
     lost, rows = int((~advances).sum()), len(t_s)
+    if back == 0 and rows - lost < MIN_ROWS:
+        sentence = (
+            f"Time does not increase: {repeated} of {rows} stamps repeat the one before. Name the column with the "
+            "stamps in --mapping, or remove the time column from the file and give the rate of the rows with --rate."
+        )
+        return [Finding.at(~advances, "stamp_order", "t", Severity.ERROR, sentence)], advances
     severity, treatment, option = (
         (Severity.REPAIRED, f"{lost} of {rows} rows were left out; {NUMBERING}", None)
         if mapping.stamps == "drop"

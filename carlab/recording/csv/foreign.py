@@ -15,7 +15,7 @@ from carlab.core.errors import DataError
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.audit import Channels, audit_channels, check_heading
-from carlab.recording.audit.file_checks import check_jumps, check_missing, check_order, check_stamps
+from carlab.recording.audit.file_checks import MIN_ROWS, check_jumps, check_missing, check_order, check_stamps
 from carlab.recording.audit.report import AuditReport, Finding, Severity, raise_errors
 from carlab.recording.column_mapping import (
     CHANNELS,
@@ -154,7 +154,7 @@ def _usable_rows(
     findings += new_findings
     raise_errors(source, findings)
     usable_rows = np.flatnonzero(is_complete)[is_increasing]
-    if len(usable_rows) < 3:
+    if len(usable_rows) < MIN_ROWS:
         raise DataError(f"{source} has too few usable rows ({len(usable_rows)}); a recording needs at least three.")
     usable_values, usable_extra = (
         {name: column[usable_rows] for name, column in columns.items()} for columns in (values, extra)
