@@ -312,6 +312,7 @@ def _begun(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: c
 def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
     from carlab.experiment.campaign.campaign import check_same_car, resumed_campaign
     from carlab.experiment.campaign.report import learning_curve, restore_missing_rows, write_report
+    from carlab.experiment.campaign.run_recording import warn_of_recovered_files
     from learning.devices import available
 
     assert request.resume is not None
@@ -327,6 +328,7 @@ def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack:
         available(campaign.plan.device)
     _check_as_before(request, campaign, choice)
     campaign.move_stopped_episode()
+    warn_of_recovered_files(run, partial=False)
     if unreported := restore_missing_rows(run, campaign.plan.task):
         write_report(run, campaign.plan, learning_curve(run)[-1])
         write_result(run, unreported)

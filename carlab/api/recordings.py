@@ -182,7 +182,11 @@ def save_run(run: Path | str, path: Path | str) -> Path:
         DataError: no recording can be read, or the file cannot be written.
     """
     from carlab.experiment.campaign.report import PICTURE_FILE, learning_curve
-    from carlab.experiment.campaign.run_recording import readable_episodes, write_run_recording
+    from carlab.experiment.campaign.run_recording import (
+        readable_episodes,
+        warn_of_recovered_files,
+        write_run_recording,
+    )
     from carlab.recording.picture import save_summary
     from carlab.recording.run_folder import RunDirectory
 
@@ -192,6 +196,7 @@ def save_run(run: Path | str, path: Path | str) -> Path:
     if path.suffix not in (".rrd", ".png"):
         raise ConfigError(f"{path}: name a file that ends in .rrd or .png.")
     directory = RunDirectory(run)
+    warn_of_recovered_files(directory, partial=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".rrd":
         write_run_recording(directory, {row.episode: row for row in learning_curve(directory)}, path)

@@ -248,6 +248,20 @@ def test_resuming_a_complete_run_prints_a_message_and_changes_no_file(
     assert file_contents(folder) == before
 
 
+def test_resume_and_view_of_a_run_name_a_truncated_recording(
+    carlab: Carlab, copied: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recording = copied / "episodes" / "0001.mcap"
+    recording.write_bytes(recording.read_bytes()[: recording.stat().st_size // 2])
+    n_ticks = read_episode(recording).ticks
+    for words in (("learn", "--resume", copied), ("view", copied, "--save", tmp_path / "run.rrd")):
+        caplog.clear()
+        assert carlab(*words)[0] == 0
+        (warning,) = [record.getMessage() for record in caplog.records if "recovered" in record.getMessage()]
+        assert warning.startswith(f"{recording} ends at byte")
+        assert warning.endswith(f"{n_ticks} complete ticks were recovered; copy it again.")
+
+
 @pytest.mark.parametrize("killed_before", ["row", "report", "result"])
 def test_run_killed_after_a_recording_writes_its_report_when_it_is_resumed(
     carlab: Carlab, copied: Path, killed_before: str

@@ -16,6 +16,7 @@ from carlab.core.observation import feature_size
 from carlab.experiment.campaign.figures import EpisodeFigures, WindowPredictions, predict_ahead, predict_windows
 from carlab.experiment.campaign.training import DYNAMICS_FILE, model_folder
 from carlab.recording.atomic_files import rerun_file
+from carlab.recording.episode_builder import RECOVERY
 from carlab.recording.mcap.source import read_episode, read_recording
 from carlab.recording.rerun.blueprint import send_blueprint
 from carlab.recording.rerun.run_recording import RunRecording, episode_number
@@ -124,6 +125,17 @@ def readable_episodes(run: RunDirectory) -> list[EpisodeData]:
         except DataError as error:
             log.warning("%s", error)
     return episodes
+
+
+def warn_of_recovered_files(run: RunDirectory, *, partial: bool) -> None:
+    """Log a warning for each recording of which only the complete ticks can be read; ``partial``: also unfinished."""
+    for file in run.recordings(partial=partial):
+        try:
+            recovery = read_episode(file).metadata.get(RECOVERY)
+        except DataError:  # No complete tick: the reader of the file decides.
+            continue
+        if recovery:
+            log.warning("%s %s.", file, recovery)
 
 
 def add_windows(recording: RunRecording, dynamics: LearnedCar, number: int, file: Path) -> PredictedEpisode | None:
