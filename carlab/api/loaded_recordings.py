@@ -115,8 +115,12 @@ def _paths_of(items: Iterable[RecordingSource]) -> set[Path]:
 
 def _episodes_of_run(item: RecordingSource) -> tuple[Sequence[RecordingSource], Sequence[RecordingSource]]:
     """Episodes of a run folder to fit and to hold out (every third); for others the recording itself, to fit."""
-    if not isinstance(item, Path) or not (item / "episodes").is_dir():
+    if not isinstance(item, Path) or not item.is_dir():
         return [item], []
+    if not (item / "episodes").is_dir():
+        runs = sorted(entry for entry in item.iterdir() if (entry / "episodes").is_dir())
+        example = f", for example {runs[-1]}" if runs else ""
+        raise ConfigError(f"{item} is not the folder of a run; name a run folder{example}, or a recording.")
     from carlab.recording.mcap.source import has_ticks
 
     driven = [recording for recording in sorted((item / "episodes").glob("*.mcap")) if has_ticks(recording)]

@@ -337,6 +337,19 @@ def test_output_below_a_file_is_refused_before_the_import(
     assert {path.name for path in tmp_path.iterdir()} == {"file", "drive.csv"}
 
 
+@pytest.mark.parametrize("words", [("diagnose", "runs"), ("compare", "a.csv", "--with", "runs")])
+def test_folder_of_runs_is_refused_with_a_run_in_it(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs").mkdir()
+    code, text = carlab(*words)
+    assert code == 2
+    assert "runs is not the folder of a run; name a run folder, or a recording." in text
+    Path("runs", "2026-11-24_drive", "episodes").mkdir(parents=True)
+    assert "name a run folder, for example runs/2026-11-24_drive, or a recording." in carlab(*words)[1]
+
+
 @pytest.mark.parametrize("verb", ["diagnose", "replay", "view"])
 def test_message_of_a_verb_without_import_options_names_the_import(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
