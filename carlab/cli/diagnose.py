@@ -15,6 +15,7 @@ from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
 from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of, report_folder
 from carlab.cli.recordings import print_errors
 from carlab.cli.runs import search_callbacks
+from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import Diagnosis
@@ -34,7 +35,7 @@ class Diagnose:
     """MCAP or CSV files to fit, or run folders. Every third episode of a run folder is held out."""
 
     car: str = ARGUMENT_DEFAULT
-    held_out: Annotated[tuple[Path, ...], arg(aliases=("--holdout",))] = ARGUMENT_DEFAULT
+    held_out: Annotated[tuple[Path, ...] | None, arg(aliases=("--holdout",))] = None
     holdout_share: float | None = ARGUMENT_DEFAULT
 
     out: Path = Path("diagnosis")
@@ -58,9 +59,12 @@ class Diagnose:
 
     def run(self) -> int:
         """Diagnose and print the verdict."""
+        if self.held_out == ():
+            raise ConfigError("--held-out names no recording; name one or more after it, or remove the option.")
         report_folder(self.out)
+        arguments = arguments_of(self, diagnose) | {"held_out": self.held_out or ()}
         with search_callbacks("diagnosis") as callbacks:
-            report = diagnose(**arguments_of(self, diagnose), **callbacks)
+            report = diagnose(**arguments, **callbacks)
         for fault in report.diagnosis.data_faults:
             if fault.id == INCOMPLETE_FILE:
                 console.print(f"{fault.channel}: {fault.action}", style="yellow", soft_wrap=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +23,8 @@ from carlab.core.errors import ConfigError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 from carlab.experiment.episodes.hooks import RunHooks
+
+OPTIONS_OF_PREDICTIONS = ("horizon_s", "stride_s", "holdout_share", "adapt", "keep_events", "save")
 
 
 @dataclass
@@ -74,15 +76,19 @@ class Replay:
             car.car, vehicle=car.vehicle, reality=car.reality, dry_run=car.dry_run, seed=self.seed, is_driven=False
         )
         if choice.car.reality is not Reality.SIMULATED or self.drive:
-            for option in ("adapt", "save"):
-                if getattr(self, option):
-                    raise ConfigError(f"--{option} is for predictions by a simulated car; remove it to drive.")
+            self._refuse_options_of_predictions()
             return self._drive()
         for option, value in (("seconds", self.seconds), ("reality", car.reality)):
             if value is not None:
                 raise ConfigError(f"--{option} has no effect on predictions; add --drive, or remove it.")
         self._predict()
         return 0
+
+    def _refuse_options_of_predictions(self) -> None:
+        for option in fields(self):
+            if option.name in OPTIONS_OF_PREDICTIONS and getattr(self, option.name) != option.default:
+                name = option.name.removesuffix("_s").replace("_", "-")
+                raise ConfigError(f"--{name} is for predictions by a simulated car; remove it to drive.")
 
     def _predict(self) -> None:
         from carlab.diagnosis.report.events import event_sentences

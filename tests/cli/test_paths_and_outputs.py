@@ -71,6 +71,8 @@ def test_recording_that_is_given_twice_is_refused(carlab: Carlab, drive_csv: Pat
         (("drive", "--car", "FOLDER"), "is a folder; name a car file in it"),
         (("drive", "--vehicle", "FOLDER"), "is a folder; name a car file in it"),
         (("replay", "FOLDER"), "is a folder; name a file in it"),
+        (("diagnose", "CSV", "--held-out"), "--held-out names no recording; name one or more after it, or remove the"),
+        (("diagnose", "CSV", "--holdout"), "--held-out names no recording"),
         (("diagnose", "CSV", "--effects", "steering_lagg"), "in the catalogue; did you mean 'steering_lag'?"),
         (("diagnose", "CSV", "--effects", "drive_map"), "There is no effect 'drive_map' in the catalogue"),
     ],
@@ -258,6 +260,9 @@ def test_comments_before_the_header_are_skipped(carlab: Carlab, drive_csv: Path,
         (("--reality", "rc_car"), "--reality has no effect on predictions; add --drive, or remove it."),
         (("--drive", "--save", "a.rrd"), "--save is for predictions by a simulated car; remove it to drive."),
         (("--drive", "--adapt"), "--adapt is for predictions by a simulated car; remove it to drive."),
+        (("--drive", "--horizon", "2"), "--horizon is for predictions by a simulated car; remove it to drive."),
+        (("--drive", "--holdout-share", "0.2"), "--holdout-share is for predictions by a simulated car; remove it to"),
+        (("--drive", "--keep-events"), "--keep-events is for predictions by a simulated car; remove it to drive."),
     ],
 )
 def test_option_of_the_other_kind_of_replay_is_refused(
