@@ -133,3 +133,11 @@ def test_malformed_row_is_refused_in_one_sentence(tmp_path: Path, changed: dict[
 )
 def test_strict_parking_criterion_is_that_of_the_authors(distance_m: float, yaw_rad: float, is_strict: bool) -> None:
     assert replace(ROW, distance_m=distance_m, yaw_error_rad=yaw_rad).is_strictly_parked is is_strict
+
+
+@pytest.mark.parametrize(
+    ("end", "counts"),
+    [("COMPLETED", True), ("GOAL_REACHED", True), ("STOP_REQUESTED", False), ("TRACKING_LOST", False)],
+)
+def test_episode_that_a_fault_or_a_person_ended_is_not_strictly_parked(end: str, counts: bool) -> None:
+    assert replace(ROW, distance_m=0.01, yaw_error_rad=0.01, end=end).is_strictly_parked is counts

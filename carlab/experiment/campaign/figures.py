@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.observation import decode_state
+from carlab.core.outcome import EndReason
 from carlab.core.quantities import FloatArray
 from carlab.core.task import Task
 from carlab.experiment.campaign.quick_check import EpisodeCheck
@@ -30,6 +31,7 @@ _RENAMED_KEYS = {"foretold": "predicted_return", "reality": "verdict", "parked":
 """Keys of learn.json, versions 1 and 2, that version 3 renames."""
 _SUMMARY_FIELDS = ("distance_m", "yaw_error_rad", "speed_mps", "cost", "violations")
 """Figures of a summary that are fields of a row."""
+_REGULAR_ENDS = {each.name for each in EndReason if not each.is_safety_stop and each is not EndReason.STOP_REQUESTED}
 _TYPES: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "bool": bool, "str": str}
 
 
@@ -111,8 +113,12 @@ class EpisodeFigures:
 
     @property
     def is_strictly_parked(self) -> bool:
-        """Whether the final pose meets the criterion of the authors: within 0.05 m and 0.2 rad of the goal."""
-        return self.distance_m < STRICT_POSITION_M and self.yaw_error_rad < STRICT_YAW_RAD
+        """Whether the final pose meets the criterion of the authors: within 0.05 m and 0.2 rad of the goal.
+
+        False for an episode that a fault or a person ended; only such an episode can be without a tick.
+        """
+        is_near = self.distance_m < STRICT_POSITION_M and self.yaw_error_rad < STRICT_YAW_RAD
+        return is_near and self.end in _REGULAR_ENDS
 
 
 def _with_null(row: Mapping[str, Any]) -> dict[str, Any]:
