@@ -68,7 +68,7 @@ def check(
 ) -> CarCheck:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
-    On a car with a motor controller no command is sent for a while, to measure the controller's time-out.
+    On a real car with a motor controller no command is sent for a while, to measure the controller's time-out.
 
     Args:
         car: as for ``carlab.drive``.
@@ -107,10 +107,9 @@ def check(
                 latency = measure_latency(opened, period_s=choice.control_period_s)
         except (NotReadyError, TimeoutError) as error:
             problems.append(str(error))
-        hardware = opened.hardware if isinstance(opened, EmulatedCar) else opened
-        if isinstance(hardware, HardwareCar):
+        if isinstance(opened, HardwareCar):  # not the emulated car, whose time-out nobody can change
             with contextlib.suppress(ActuatorFaultError):  # ``health`` has the fault
-                hardware.measure_motor_timeout()
+                opened.measure_motor_timeout()
         health = opened.health()
     problems += [problem for problem in health.problems if not any(problem in known for known in problems)]
     return CarCheck(health, latency, tuple(problems))
