@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 from carlab.core.errors import ConfigError
 
 T = TypeVar("T")
+MAX_LISTED_NAMES, N_NEAREST_NAMES = 60, 5
+"""A message lists all known names up to the first number (more than the effects of the catalogue), else the nearest."""
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
@@ -24,9 +26,17 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
 
 
 def nearest_name(name: str, known: Sequence[str], otherwise: str = "choose among") -> str:
-    """End of a message about an unknown name: the nearest known name, or ``otherwise`` and all of them."""
+    """End of a message about an unknown name: the nearest known name, or ``otherwise`` and all of them.
+
+    Of more than ``MAX_LISTED_NAMES`` names, only the nearest ones are listed.
+    """
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean '{near[0]}'?" if near else f"{otherwise} {', '.join(known)}."
+    if near:
+        return f"did you mean '{near[0]}'?"
+    if len(known) <= MAX_LISTED_NAMES:
+        return f"{otherwise} {', '.join(known)}."
+    nearest = difflib.get_close_matches(name, known, n=N_NEAREST_NAMES, cutoff=0.0)
+    return f"the nearest of {len(known)} names are {', '.join(nearest)}."
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:

@@ -137,6 +137,15 @@ def test_unknown_name_is_refused_with_the_nearest_name_of_its_table(name, messag
         SimulatorConfig().with_values({"vehicle.mass": 2.0, name: 0.5})
 
 
+def test_message_about_an_unknown_name_lists_the_nearest_of_many():
+    with pytest.raises(ConfigError) as refused:
+        SimulatorConfig().with_values({"grip": 0.5})
+    message = str(refused.value)
+    assert message.startswith(f"Unknown key 'grip' in the parameters; the nearest of {len(REGISTRY)} names are ")
+    assert "effects.grip_change.share" in message
+    assert message.count(",") == 4
+
+
 def test_effect_that_is_not_registered_is_refused_with_the_remedy():
     with pytest.raises(ConfigError, match=r"'cubic_drag' in \[effects\].* Register an effect of your own at the top"):
         SimulatorConfig.from_tables({"effects": {"cubic_drag": {"coefficient": 0.5}}})
