@@ -20,12 +20,13 @@ from carlab.core.car import Car
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import CarState, Observation
 from carlab.core.safety import SafetyEnvelope
+from carlab.diagnosis.comparison.candidates import change_candidates
 from carlab.diagnosis.findings import EffectFinding, Estimate, FitErrors
 from carlab.experiment.episodes.result import EpisodeResult
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from mocap.config import MocapConfig
-from sim_backends.car_parameters import preset_names
+from sim_backends.car_parameters import SimulatorConfig, preset_names
 from sim_backends.effects import CATALOGUE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -239,6 +240,12 @@ def test_each_effect_of_the_catalogue_has_a_picture() -> None:
 def test_number_of_effects_is_that_of_the_catalogue(page: str) -> None:
     numbers = re.findall(r"\b(\d\d) effects", (ROOT / page).read_text(encoding="utf-8"))
     assert set(numbers) == {str(len(CATALOGUE))}
+
+
+def test_number_of_candidates_of_a_comparison_is_stated() -> None:
+    page = (ROOT / "docs/how-to/compare-drives.md").read_text(encoding="utf-8")
+    counts = [len(change_candidates(SimulatorConfig.from_preset(name))) for name in preset_names()]
+    assert f"all candidates ({min(counts)} to {max(counts)} by the car file: effects and parameters" in page
 
 
 @pytest.mark.parametrize("page", ["docs/glossary.md", "docs/reference/car-file.md"])
