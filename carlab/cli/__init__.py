@@ -106,12 +106,18 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _where_options_belong(verb: str, error: Exception) -> str:
-    """A sentence for a refused CSV whose message names options that only ``carlab import`` has; else empty."""
+    """A sentence for a refused CSV whose message names options that only ``carlab import`` has; else empty.
+
+    It follows the message, or stands in its own line below a list of faults.
+    """
     from carlab.recording.audit.report import RefusedError
 
-    if verb == "import" or not isinstance(error, RefusedError) or not any(f.option for f in error.findings):
+    n_options = sum(bool(f.option) for f in error.findings) if isinstance(error, RefusedError) else 0
+    if verb == "import" or not isinstance(error, RefusedError) or not n_options:
         return ""
-    return f" Convert the file with carlab import and this option first, then {verb} the .mcap file."
+    space = " " if len(error.findings) == 1 else "\n"
+    what = "this option" if n_options == 1 else "these options"
+    return f"{space}Convert the file with carlab import and {what} first, then {verb} the .mcap file."
 
 
 _DESCRIPTION = (

@@ -373,6 +373,16 @@ def test_message_of_a_verb_without_import_options_names_the_import(
     assert "carlab import --mapping FILE.toml" in carlab(verb, path)[1]
 
 
+def test_import_is_named_below_a_list_of_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, data = canonical_csv(tmp_path)
+    data[:, 7:] *= 100.0
+    write(path, data)
+    assert cli.run(["diagnose", str(path)]) == 1
+    *faults, last = capsys.readouterr().err.splitlines()
+    assert any("--throttle-scale 0.01" in line for line in faults)
+    assert last == "Convert the file with carlab import and these options first, then diagnose the .mcap file."
+
+
 def test_empty_car_file_is_not_the_default_car(carlab: Carlab, tmp_path: Path) -> None:
     path = tmp_path / "car.toml"
     path.write_text("# cut off\n", encoding="utf-8")
