@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from carlab.core.angles import wrap
-from carlab.recording.audit.report import RefusedError, Severity
+from carlab.recording.audit.report import Finding, RefusedError, Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.pose import rows_off_path
 from carlab.recording.pose_velocity import pose_jumps
 
@@ -279,6 +280,25 @@ def test_columns_with_held_samples_are_found_with_their_rate(tmp_path):
     assert finding.channel == "throttle, encoder"
     assert finding.evidence["rows"] == 10
     assert finding.evidence["rate_hz"] == pytest.approx(10.0, rel=1e-3)
+    assert finding.sentence.startswith("New values come only every 10 rows")
+    assert "encoder" not in finding.sentence, "the channel of the finding lists the columns"
+
+
+def test_sentence_that_begins_with_a_column_keeps_its_spelling():
+    lag = Fault("column_shift", "vx, vy", "vx, vy lag the differentiated pose by 9 ms")
+    assert Finding.of_fault(lag).sentence == "Columns vx, vy lag the differentiated pose by 9 ms."
+    spikes = Fault("outliers", "yaw_rate", "yaw_rate has 3 spikes", option="--repair-yaw-rate")
+    assert Finding.of_fault(spikes).sentence == "Column yaw_rate has 3 spikes; use --repair-yaw-rate."
+    other = Fault("wrong_sign", "steering", "with positive steering the car turns right")
+    assert Finding.of_fault(other).sentence == "With positive steering the car turns right."
+
+
+def test_stamps_that_an_even_clock_replaces_are_not_called_unchanged(clean, tmp_path):
+    for clock, is_unchanged in (("column", True), ("even", False)):
+        imported = import_drive(tmp_path, clean, clock=clock)
+        (jitter,) = imported.report.of("stamp_jitter")
+        assert ("does not change the stamps" in jitter.sentence) is is_unchanged
+        assert ("stamps of an even clock" in imported.announcement) is not is_unchanged
 
 
 def test_nominal_clock_over_uneven_rows_is_found_and_rebuilt(tmp_path):

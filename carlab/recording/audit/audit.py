@@ -247,7 +247,7 @@ def _check_yaw_rate(
         findings.append(Finding.of_fault(fault, remedy=f"take those rows from the pose with {fault.option}"))
     if spikes.others.any():
         sentence = (
-            f"yaw_rate is far from the turn rate of yaw in {spikes.others.sum()} further rows (first row "
+            f"Column yaw_rate is far from the turn rate of yaw in {spikes.others.sum()} further rows (first row "
             f"{np.argmax(spikes.others) + 1}): an impact, or a frame that came late."
         )
         findings.append(Finding.at(spikes.others, "outliers", "yaw_rate", Severity.INFO, sentence))

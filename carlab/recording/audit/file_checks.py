@@ -143,7 +143,7 @@ def check_stamps(t_s: FloatArray, mapping: ColumnMapping) -> list[Finding]:
     gaps = gap_rows(t_s)
     findings = [] if unit is None else [unit]
     findings += [_gap_finding(t_s, gaps, mapping)] if len(gaps) else []
-    return findings + (_check_even_stamps(t_s) or _check_jitter(t_s, gaps))
+    return findings + (_check_even_stamps(t_s) or _check_jitter(t_s, gaps, mapping))
 
 
 def _check_time_unit(t_s: FloatArray, mapping: ColumnMapping) -> Finding | None:
@@ -208,7 +208,7 @@ def _check_even_stamps(t_s: FloatArray) -> list[Finding]:
     return [Finding("nominal_clock", "t", Severity.INFO, sentence, evidence=evidence)]
 
 
-def _check_jitter(t_s: FloatArray, gaps: IndexArray) -> list[Finding]:
+def _check_jitter(t_s: FloatArray, gaps: IndexArray, mapping: ColumnMapping) -> list[Finding]:
     """Steps of time, other than ``gaps``, that vary by more than 5 % or are off by more than half a period."""
     step = np.diff(t_s)
     median = float(np.median(step))
@@ -219,9 +219,10 @@ def _check_jitter(t_s: FloatArray, gaps: IndexArray) -> list[Finding]:
     longest = float(np.delete(step, gaps - 1).max())
     sentence = (
         f"Rows are {median * 1e3:.2f} ms apart, 98 % of them between {low * 1e3:.2f} and {high * 1e3:.2f} ms; "
-        f"{len(odd)} steps are off by more than half a period (the longest without a gap {longest * 1e3:.1f} ms). "
-        "Stamps are kept as they are."
+        f"{len(odd)} steps are off by more than half a period (the longest without a gap {longest * 1e3:.1f} ms)."
     )
+    if mapping.clock == "column":
+        sentence += " The import does not change the stamps."
     evidence = {"median_s": median, "p1_s": low, "p99_s": high, "shortest_s": float(step.min())}
     return [Finding.at(odd, "stamp_jitter", "t", Severity.INFO, sentence, evidence)]
 
@@ -246,8 +247,8 @@ def check_held(t_s: FloatArray, columns: Mapping[str, FloatArray]) -> list[Findi
     for length, names in sorted(held.items()):
         rate_hz = 1 / (length * period)
         sentence = (
-            f"{', '.join(names)}: new values only every {length} rows, {rate_hz:.1f} Hz in rows of {1 / period:.1f} "
-            f"Hz; a change is seen up to {length * period:.2f} s late."
+            f"New values come only every {length} rows, {rate_hz:.1f} Hz in rows of {1 / period:.1f} Hz; a change is "
+            f"seen up to {length * period:.2f} s late."
         )
         evidence = {"rows": length, "rate_hz": rate_hz}
         findings.append(Finding("held_samples", ", ".join(names), Severity.INFO, sentence, evidence=evidence))

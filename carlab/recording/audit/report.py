@@ -69,9 +69,15 @@ class Finding:
 
     @classmethod
     def of_fault(cls, fault: Fault, severity: Severity = Severity.FAULT, remedy: str | None = None) -> Finding:
-        """A fault with its remedy, by default its option. A repaired fault has no option left."""
+        """A fault with its remedy, by default its option. A repaired fault has no option left.
+
+        The name of a column at the beginning of the sentence keeps its spelling.
+        """
         clause = f"use {fault.option}" if remedy is None and fault.option else remedy
-        sentence = fault.observation[0].upper() + fault.observation[1:] + (f"; {clause}." if clause else ".")
+        observation = fault.observation
+        if observation.startswith(f"{fault.channel} "):
+            observation = f"column{'s' if ', ' in fault.channel else ''} {observation}"
+        sentence = observation[0].upper() + observation[1:] + (f"; {clause}." if clause else ".")
         option = None if severity is Severity.REPAIRED else fault.option
         return cls.at(fault.rows, fault.id, fault.channel, severity, sentence, fault.evidence, option)
 

@@ -381,7 +381,7 @@ def _conversions(mapping: ColumnMapping) -> str:
     if mapping.command_lag_s:
         conversions.append(f"commands shifted {mapping.command_lag_s * 1e3:.0f} ms earlier")
     if mapping.clock == "even":
-        conversions.append("stamps replaced by those of an even clock")
+        conversions.append("stamps of an even clock in place of the recorded ones")
     if mapping.dead_reckoning:
         conversions.append("pose integrated from speed and turn rate")
     return ", ".join(conversions) if conversions else "nothing needed conversion"
