@@ -6,9 +6,10 @@ import importlib
 from dataclasses import dataclass
 
 from carlab.api.arguments import above_zero, at_least, at_most
-from carlab.cli.bench_options import BenchOptions, check_options, row_counts
+from carlab.cli.bench_options import STUDIES, BenchOptions, check_options, row_counts
 from carlab.cli.console import console, table
 from carlab.cli.options import json_file
+from carlab.core.errors import ConfigError
 from carlab.core.seeds import MAX_SEED
 from carlab.recording.atomic_files import write_json
 
@@ -21,6 +22,9 @@ class Bench(BenchOptions):
         """Measure and print."""
         from learning.devices import available
 
+        if self.what is None:
+            studies = "".join(f"\n  carlab bench {name}: {text}" for name, text in STUDIES.items())
+            raise ConfigError(f"Name a study (carlab bench --help describes them):{studies}")
         if not self.ray:
             available(self.device)
         if self.out is not None:

@@ -158,7 +158,7 @@ def bench_job(
         more: further options.
         files: contents of the files that it reads.
     """
-    command = [*CARLAB, "bench", options.what, "--out", FIGURES, "--rows", str(rows), "--seeds", "1"]
+    command = [*CARLAB, "bench", str(options.what), "--out", FIGURES, "--rows", str(rows), "--seeds", "1"]
     command += ["--first-seed", str(seed), "--device", options.device, *more]
     if options.steps is not None:
         command += ["--steps", str(options.steps)]

@@ -15,15 +15,15 @@ from carlab.core.errors import ConfigError
 class BenchOptions:
     """Options of all uses of ``carlab bench``."""
 
-    what: Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"]] = "speed"
-    """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender. regression: models fitted
-    to few rows, by carlab's methods, the paper's methods and baselines, on the cases of the paper. priors: carlab's
-    method with four priors (none, kinematic, nominal, diagnosed), on a simulated car with two concealed effects or on
-    the recordings in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are
-    continued. realcars: prediction errors on held-out recordings of a real car in --data, for constant velocity, the
-    car file, refit, named effects, measured curves, a learned discrepancy, a black box and adaptation. rollouts:
-    coverage and error of the rollouts of a learned car on the last recording in --data, with and without a
-    disturbance."""
+    what: Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"] | None] = None
+    """The study; without one, the command lists the studies. speed: simulator, gradients, learning, NatNet decoding,
+    lateness of the command sender. regression: models fitted to few rows, by carlab's methods, the paper's methods and
+    baselines, on the cases of the paper. priors: carlab's method with four priors (none, kinematic, nominal,
+    diagnosed), on a simulated car with two concealed effects or on the recordings in --data. parking: carlab learn on
+    the simulated car, for each method; existing runs in --runs are continued. realcars: prediction errors on held-out
+    recordings of a real car in --data, for constant velocity, the car file, refit, named effects, measured curves, a
+    learned discrepancy, a black box and adaptation. rollouts: coverage and error of the rollouts of a learned car on
+    the last recording in --data, with and without a disturbance."""
 
     out: Path | None = None
     """Write the figures to FILE.json (regression, priors and rollouts: after each fit). regression, priors and parking
@@ -146,6 +146,16 @@ SPEED, REGRESSION, PRIORS = "'bench speed'", "'bench regression'", "'bench prior
 PARKING, ROLLOUTS, REALCARS = "'bench parking'", "'bench rollouts'", "'bench realcars'"
 REALCAR, PENDULUM = "'bench regression --case realcar'", "'bench regression --case pendulum'"
 READ, CONCEALED = "'bench priors --data FOLDER'", "'bench priors' without --data"
+
+STUDIES = {
+    "speed": "simulator, gradients, learning, NatNet decoding and command sender; takes about five minutes",
+    "regression": "models fitted to few rows, by carlab's methods, the paper's methods and baselines",
+    "priors": "carlab's method with four priors",
+    "parking": "carlab learn on the simulated car, for each method",
+    "realcars": "prediction errors on held-out recordings of a real car (--data)",
+    "rollouts": "coverage and error of the rollouts of a learned car on recordings (--data)",
+}
+"""What each study measures, in one line."""
 
 EVERYWHERE = frozenset({"what", "out", "device", "verbose"})
 STUDIES_OF_OPTION = {

@@ -6,6 +6,7 @@ import re
 import shlex
 from dataclasses import fields
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import tyro
@@ -98,6 +99,17 @@ def test_commands_of_the_readme_are_accepted(command: str) -> None:
     parsed = tyro.extras.subcommand_cli_from_dict(_verbs(), args=shlex.split(command)[1:], prog="carlab")
     assert isinstance(parsed, Bench)
     check_options(parsed)
+
+
+def test_bench_without_a_study_lists_the_studies_and_runs_none(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("carlab.studies.speed.measure_speed", lambda **options: pytest.fail("a study ran"))
+    assert run(["bench"]) == 2
+    _, *lines = capsys.readouterr().err.splitlines()
+    studies = [re.match(r"  carlab bench (\w+): \w", line) for line in lines]
+    offered, _ = get_args(get_type_hints(Bench)["what"])
+    assert tuple(study and study[1] for study in studies) == get_args(offered)
 
 
 def test_all_rows_are_refused_in_studies_of_few_rows() -> None:
