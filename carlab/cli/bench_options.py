@@ -148,7 +148,7 @@ REALCAR, PENDULUM = "'bench regression --case realcar'", "'bench regression --ca
 READ, CONCEALED = "'bench priors --data FOLDER'", "'bench priors' without --data"
 
 STUDIES = {
-    "speed": "simulator, gradients, learning, NatNet decoding and command sender; takes about five minutes",
+    "speed": "simulator, gradients, learning, NatNet decoding and lateness of the command sender",
     "regression": "models fitted to few rows, by carlab's methods, the paper's methods and baselines",
     "priors": "carlab's method with four priors",
     "parking": "carlab learn on the simulated car, for each method",
