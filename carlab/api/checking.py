@@ -68,7 +68,7 @@ def check(
 ) -> CarCheck:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
-    On a real car with a motor controller no command is sent for a while, to measure the controller's time-out.
+    On a car with a motor controller no command is sent for a while, to measure the controller's time-out.
 
     Args:
         car: as for ``carlab.drive``.
@@ -107,9 +107,10 @@ def check(
                 latency = measure_latency(opened, period_s=choice.control_period_s)
         except (NotReadyError, TimeoutError) as error:
             problems.append(str(error))
-        if isinstance(opened, HardwareCar):  # not the emulated car, whose time-out nobody can change
+        hardware = opened.hardware if isinstance(opened, EmulatedCar) else opened
+        if isinstance(hardware, HardwareCar):
             with contextlib.suppress(ActuatorFaultError):  # ``health`` has the fault
-                opened.measure_motor_timeout()
+                hardware.measure_motor_timeout()
         health = opened.health()
     problems += [problem for problem in health.problems if not any(problem in known for known in problems)]
     return CarCheck(health, latency, tuple(problems))

@@ -19,7 +19,7 @@ from carlab.experiment.episodes.hooks import RunHooks
 class Check:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
-    On a real car with a motor controller no command is sent for a while, to measure the controller's time-out.
+    On a car with a motor controller no command is sent for a while, to measure the controller's time-out.
 
     With --task, first find errors of shape and unit in a task.
 

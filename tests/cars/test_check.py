@@ -47,13 +47,6 @@ def test_fault_during_the_check_is_a_problem_among_the_readings(tmp_path: Path) 
 
 
 @pytest.mark.realtime
-def test_check_of_the_emulated_car_warns_of_nothing() -> None:
-    found = carlab.check("emulated", seconds=0.5)
-    assert found.is_ready
-    assert found.health.warnings == ()
-
-
-@pytest.mark.realtime
 def test_check_without_poses_measures_the_motor_timeout_and_names_the_problem_once(tmp_path: Path) -> None:
     with World(WorldConfig(SimulatorConfig().to_tables(), motor_timeout_s=0.25)) as world:
         world.server.faults = ServerFaults(occlusion=1.0)
