@@ -24,7 +24,7 @@ class Bench(BenchOptions):
 
         if self.what is None:
             studies = "".join(f"\n  carlab bench {name}: {text}" for name, text in STUDIES.items())
-            raise ConfigError(f"Name a study (carlab bench --help describes them):{studies}")
+            raise ConfigError(f"Name a study:{studies}")
         if not self.ray:
             available(self.device)
         if self.out is not None:

@@ -4,26 +4,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from carlab.core.errors import ConfigError
+
+STUDIES = {
+    "speed": "simulator, gradients, learning, NatNet decoding, lateness of the command sender",
+    "regression": "models fitted to few rows, by carlab's methods, the paper's methods and baselines, on the cases of "
+    "the paper",
+    "priors": "carlab's method with four priors (none, kinematic, nominal, diagnosed), on a simulated car with two "
+    "concealed effects or on the recordings in --data",
+    "parking": "carlab learn on the simulated car, for each method; existing runs in --runs are continued",
+    "realcars": "prediction errors on held-out recordings of a real car in --data, for constant velocity, the car "
+    "file, refit, named effects, measured curves, a learned discrepancy, a black box and adaptation",
+    "rollouts": "coverage and error of the rollouts of a learned car on the last recording in --data, with and without "
+    "a disturbance",
+}
+"""What each study measures."""
+_STUDY_HELP = "The study; without one, the command lists the studies. " + " ".join(
+    f"{name}: {text}." for name, text in STUDIES.items()
+)
 
 
 @dataclass
 class BenchOptions:
     """Options of all uses of ``carlab bench``."""
 
-    what: Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"] | None] = None
-    """The study; without one, the command lists the studies. speed: simulator, gradients, learning, NatNet decoding,
-    lateness of the command sender. regression: models fitted to few rows, by carlab's methods, the paper's methods and
-    baselines, on the cases of the paper. priors: carlab's method with four priors (none, kinematic, nominal,
-    diagnosed), on a simulated car with two concealed effects or on the recordings in --data. parking: carlab learn on
-    the simulated car, for each method; existing runs in --runs are continued. realcars: prediction errors on held-out
-    recordings of a real car in --data, for constant velocity, the car file, refit, named effects, measured curves, a
-    learned discrepancy, a black box and adaptation. rollouts: coverage and error of the rollouts of a learned car on
-    the last recording in --data, with and without a disturbance."""
+    what: Annotated[
+        Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"] | None],
+        arg(help=_STUDY_HELP),
+    ] = None
 
     out: Path | None = None
     """Write the figures to FILE.json (regression, priors and rollouts: after each fit). regression, priors and parking
@@ -146,16 +158,6 @@ SPEED, REGRESSION, PRIORS = "'bench speed'", "'bench regression'", "'bench prior
 PARKING, ROLLOUTS, REALCARS = "'bench parking'", "'bench rollouts'", "'bench realcars'"
 REALCAR, PENDULUM = "'bench regression --case realcar'", "'bench regression --case pendulum'"
 READ, CONCEALED = "'bench priors --data FOLDER'", "'bench priors' without --data"
-
-STUDIES = {
-    "speed": "simulator, gradients, learning, NatNet decoding and lateness of the command sender",
-    "regression": "models fitted to few rows, by carlab's methods, the paper's methods and baselines",
-    "priors": "carlab's method with four priors",
-    "parking": "carlab learn on the simulated car, for each method",
-    "realcars": "prediction errors on held-out recordings of a real car (--data)",
-    "rollouts": "coverage and error of the rollouts of a learned car on recordings (--data)",
-}
-"""What each study measures, in one line."""
 
 EVERYWHERE = frozenset({"what", "out", "device", "verbose"})
 STUDIES_OF_OPTION = {
