@@ -1,4 +1,4 @@
-"""A candidate is accepted, and an effect kept, exactly if the conditions hold that its decision records."""
+"""A candidate is accepted, and an effect remains, exactly if the conditions of its recorded decision hold."""
 
 from dataclasses import replace
 
@@ -83,7 +83,7 @@ def test_simpler_candidate_is_next_if_left_out_blocks_do_not_distinguish_it(
 
 
 @pytest.mark.parametrize("offset", [-1e-9, 0.0, 1e-9])
-def test_effect_is_kept_exactly_if_its_recorded_condition_holds(
+def test_effect_remains_exactly_if_its_recorded_condition_holds(
     problem: SearchProblem, strong: Candidate, monkeypatch: pytest.MonkeyPatch, offset: float
 ) -> None:
     rise = problem.settings.selection.keep_z_min + offset
@@ -95,6 +95,6 @@ def test_effect_is_kept_exactly_if_its_recorded_condition_holds(
     named = ("aerodynamic_drag", "steering_lag")
     model = Model(named, strong.fit, Scale(np.array([1]), np.ones((1, 6))))
     decisions: list[Decision] = []
-    kept = eliminate(problem, model, RunControl(record=decisions.append)).model.effects == named
-    assert [decision.passed for decision in decisions] == [kept]
-    assert [passes(decision.alternatives) for decision in decisions] == [kept]
+    both_remain = eliminate(problem, model, RunControl(record=decisions.append)).model.effects == named
+    assert [decision.passed for decision in decisions] == [both_remain]
+    assert [passes(decision.alternatives) for decision in decisions] == [both_remain]

@@ -55,7 +55,7 @@ def rival_of(true: SimulatorConfig) -> tuple[tuple[str, ...], RivalPhysics | Non
     return found.effects, rival, decisions
 
 
-def test_throttle_curve_replaces_names_of_a_map_that_no_effect_has() -> None:
+def test_throttle_curve_replaces_effects_that_resemble_another_map() -> None:
     with registered(WavyThrottle()):
         names, rival, decisions = rival_of(replace(CAR, effects={"wavy_throttle": {"size": 0.06}}))
     assert names
@@ -74,7 +74,7 @@ def test_throttle_curve_replaces_names_of_a_map_that_no_effect_has() -> None:
     ("effect", "values"),
     [("throttle_nonlinearity", {"exponent": 1.4}), ("throttle_asymmetry", {"gain_ratio": 0.6})],
 )
-def test_named_effect_of_the_throttle_stands(effect: str, values: dict[str, float]) -> None:
+def test_throttle_curve_does_not_replace_a_true_effect(effect: str, values: dict[str, float]) -> None:
     names, rival, decisions = rival_of(replace(CAR, effects={effect: values}))
     assert names == (effect,)
     assert rival is None

@@ -93,7 +93,7 @@ def test_throttle_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypa
         ("throttle_asymmetry", "catalogue"),
     ],
 )
-def test_effect_that_a_curve_contains_keeps_its_name(
+def test_effect_that_a_curve_contains_is_named(
     effect: str, form: FormName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     candidates = STATIC if effect.startswith("steering") else STATIC_THROTTLE

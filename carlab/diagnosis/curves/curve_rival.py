@@ -36,8 +36,8 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         control: records the decision about each effect that a curve contains.
 
     Returns:
-        The first such curve with the other effects. None if the named effects stand, without any that a curve
-        contains, and after a search that was cut short: the curve may then stand for an effect that was not tried.
+        The first such curve with the other effects. None if no curve explains more, if no accepted effect is contained
+        in a curve, and after a search that was cut short: the curve may then imitate an effect that was not tried.
     """
     if not found.is_complete:
         return None
