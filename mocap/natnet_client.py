@@ -348,14 +348,15 @@ class NatNetClient(Resource):
         frame = self._decoder.decode_frame(payload)
         self._schedule.note_frame(received_s)
         with self._changed:
-            restarts = self._statistics.restarts
+            restarts, lost = self._statistics.restarts, self._statistics.lost
             sequence = self._statistics.accept(frame.frame_number, received_s)
             if sequence is None:
                 return
             capture_s = self._capture_time(frame, received_s)
             self._is_recording = bool(frame.params & FRAME_RECORDING)
             has_restarted = self._statistics.restarts > restarts
-            if frame.params & FRAME_MODELS_CHANGED or has_restarted:
+            has_gap = self._statistics.lost > lost  # a missing frame may have had the flag
+            if frame.params & FRAME_MODELS_CHANGED or has_gap or has_restarted:
                 self._schedule.models_outdated = True
         if has_restarted and self._on_models is not None:
             self._on_models(())

@@ -20,8 +20,8 @@ MODE_PERIOD_S = 0.5
 class MessageSchedule:
     """Schedule of keep-alives, echoes, reconnects and requests for the server's mode and for changed models.
 
-    ``models_outdated`` is set by frames with the models-changed flag and cleared when models arrive, so that a lost
-    request is repeated and a further change is noticed.
+    ``models_outdated`` is set by frames with the models-changed flag and by missing frames, which may have had it. It
+    is cleared when models arrive, so that a lost request is repeated and a further change is noticed.
     """
 
     def __init__(self, *, keepalives: bool) -> None:
