@@ -33,6 +33,7 @@ RECENT_FRAMES = 60
 that was carried can be armed soon after it stands level again, and not while the network is congested."""
 RECENT_SHARE = 0.2
 """Share of the recent frames that may be tilted, or invalid, by single errors of tracking [1]."""
+BODY_REMOVED = "the server no longer has the body; define it again in Motive under the same name."
 
 
 class RigidBodyPoseSource(Resource):
@@ -51,6 +52,7 @@ class RigidBodyPoseSource(Resource):
         self._new_sample = threading.Condition()
         self._samples: deque[PoseSample] = deque(maxlen=max_samples)
         self._body: RigidBodyDescription | None = None
+        self._reason_for_no_body = BODY_REMOVED
         self._selection = config
         self._is_open = False
         self._clear_counts()
@@ -145,7 +147,7 @@ class RigidBodyPoseSource(Resource):
             found += self._unit_problems()
             found += self._axis_problems()
             if self._body is None and self._is_open:
-                found.append("the server no longer has the body; define it again in Motive under the same name.")
+                found.append(self._reason_for_no_body)
             if _share(self._recent_unusable) > RECENT_SHARE:
                 found.append(
                     f"more than {RECENT_SHARE:.0%} of the newest frames have an invalid pose of the body (NaN or no "
@@ -216,12 +218,14 @@ class RigidBodyPoseSource(Resource):
     def _on_models(self, models: tuple[Description, ...]) -> None:
         if not self._is_open:
             return
+        body, reason = None, BODY_REMOVED
         try:
             body = select_body(models, self._selection)
-        except NotReadyError:
-            body = None
+        except NotReadyError as error:
+            if _matching_bodies(models, self._selection):  # two bodies match; a further one does not help
+                reason = error.reasons[0]
         with self._new_sample:
-            self._body = body
+            self._body, self._reason_for_no_body = body, reason
 
     def _on_frame(self, frame: Frame, sequence: int, capture_s: float, received_s: float) -> None:
         with self._new_sample:
@@ -280,15 +284,28 @@ def _share(flags: Collection[bool]) -> float:
     return sum(flags) / len(flags) if flags else 0.0
 
 
+def _bodies(models: Sequence[Description]) -> list[RigidBodyDescription]:
+    return [model for model in models if isinstance(model, RigidBodyDescription)]
+
+
+def _matching_bodies(models: Sequence[Description], config: MocapConfig) -> list[RigidBodyDescription]:
+    """Rigid bodies with the id or the name of ``config``; without both the only body."""
+    bodies = _bodies(models)
+    if config.body_id is not None:
+        return [b for b in bodies if b.id == config.body_id]
+    if config.body:
+        return [b for b in bodies if b.name == config.body]
+    return bodies if len(bodies) == 1 else []
+
+
 def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBodyDescription:
     """Select the rigid body of ``config``. Raises NotReadyError with a list of the available bodies."""
-    bodies = [model for model in models if isinstance(model, RigidBodyDescription)]
+    bodies = _bodies(models)
+    chosen = _matching_bodies(models, config)
     if config.body_id is not None:
-        wanted, chosen = f"with id {config.body_id}", [b for b in bodies if b.id == config.body_id]
-    elif config.body:
-        wanted, chosen = f"'{config.body}'", [b for b in bodies if b.name == config.body]
+        wanted = f"with id {config.body_id}"
     else:
-        wanted, chosen = "that is the only one", bodies if len(bodies) == 1 else []
+        wanted = f"'{config.body}'" if config.body else "that is the only one"
     if chosen and len(sharing := [b.name for b in bodies if b.id == chosen[0].id]) > 1:
         raise NotReadyError(
             "No motion capture",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import pytest
 
@@ -45,3 +46,23 @@ def test_changed_ids_are_noticed_if_every_frame_with_the_flag_is_lost(serve: Ser
         assert later is not None
         assert later.tracked
         assert later.x_m == PLACES_M["car"]
+
+
+@pytest.mark.parametrize(
+    ("bodies", "reason"),
+    [
+        ((EmulatedBody("car", 1), EmulatedBody("car", 2)), "set body_id in [hardware.mocap]"),
+        ((EmulatedBody("lorry", 1), EmulatedBody("car", 1)), "'lorry' and 'car' have the same streaming id 1"),
+        ((EmulatedBody("lorry", 1), EmulatedBody("truck", 2)), "define it again in Motive under the same name"),
+    ],
+)
+def test_reason_why_the_body_has_become_unknown_is_named(
+    serve: Serve, configure: Configure, bodies: Sequence[Any], reason: str
+) -> None:
+    before = (EmulatedBody("car", 1), EmulatedBody("lorry", 2))
+    server = serve(lambda t_s: [RigidBodySample.planar(t_s, 1.0, 0.0, 0.0)] * 2, bodies=before)
+    with RigidBodyPoseSource(configure(server, body="car")) as source:
+        server.set_bodies(bodies)
+        until(lambda: bool(source.problems()))
+        (text,) = source.problems()
+        assert reason in text
