@@ -22,21 +22,20 @@ CONTROLLER_PROBLEM: Final = 0x04
 SENDS_ERROR_PASSIVE: Final = 0x20
 """Detail: error-passive, since frames were repeated without acknowledgement (CAN_ERR_CRTL_TX_PASSIVE)."""
 MAX_FRAMES_PER_READ: Final = 256
-BITRATE_INTERFACES: Final = frozenset({"slcan", "pcan", "kvaser", "vector", "ixxat", "gs_usb", "usb2can", "canalystii"})
 
 
 def open_bus(interface: str, channel: str, bitrate: int) -> can.BusABC:
     """Open a python-can bus without reading the user's python-can configuration files.
 
+    Interfaces whose bitrate the system sets (socketcan) ignore ``bitrate``. The channel of ``gs_usb`` is a number.
     ``udp_multicast`` with an IPv4 group stays on this host's loopback interface; its channel is GROUP or GROUP:PORT.
     """
     if interface == "udp_multicast" and _is_ipv4(channel):
         from drivers.links.loopback_multicast import LoopbackMulticastBus
 
         return LoopbackMulticastBus(channel)
-    if interface in BITRATE_INTERFACES:
-        return can.Bus(channel, interface=interface, ignore_config=True, bitrate=bitrate)
-    return can.Bus(channel, interface=interface, ignore_config=True)
+    adapter = int(channel) if interface == "gs_usb" and channel.isdecimal() else channel
+    return can.Bus(adapter, interface=interface, ignore_config=True, bitrate=bitrate)
 
 
 def _is_ipv4(channel: str) -> bool:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import errno
+import sys
 import time
 import uuid
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
 
 import can
 import pytest
+from can.interfaces import BACKENDS
 from can.interfaces.virtual import VirtualBus
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
@@ -137,6 +142,40 @@ def test_echo_of_an_own_frame_is_ignored() -> None:
 def test_interface_that_raises_an_error_of_its_library_is_not_ready(interface: str, channel: str) -> None:
     with pytest.raises(NotReadyError, match=r"cannot be opened: .* the driver of the adapter"):
         CanLink(interface, channel).open()
+
+
+def test_gs_usb_adapter_is_opened_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bus is that of python-can; only the library of the adapter is replaced."""
+    library = MagicMock()
+    library.GsUsb.scan.return_value = [adapter := MagicMock()]
+    adapter.device_capability.fclk_can = 48_000_000
+    for name in ("usb", "gs_usb", "gs_usb.constants", "gs_usb.gs_usb", "gs_usb.gs_usb_frame"):
+        monkeypatch.setitem(sys.modules, name, library)
+    monkeypatch.delitem(sys.modules, "can.interfaces.gs_usb", raising=False)
+    link = CanLink("gs_usb", "0", 250_000)
+    link.open()
+    link.close()
+    timing = adapter.set_timing.call_args.kwargs
+    quanta = 1 + timing["prop_seg"] + timing["phase_seg1"] + timing["phase_seg2"]
+    assert 48_000_000 / (timing["brp"] * quanta) == 250_000
+
+
+def test_every_interface_gets_the_bitrate(monkeypatch: pytest.MonkeyPatch) -> None:
+    bitrates = []
+
+    class Recorder(VirtualBus):
+        def __init__(self, channel: str, bitrate: int = 500_000, **options: Any) -> None:
+            bitrates.append(bitrate)
+            super().__init__(channel)
+
+    monkeypatch.setitem(sys.modules, "recorder", SimpleNamespace(Recorder=Recorder))
+    interfaces = ("pcan", "seeedstudio", "systec", "cantact", "of_another_package")
+    for interface in interfaces:
+        monkeypatch.setitem(BACKENDS, interface, ("recorder", "Recorder"))
+        link = CanLink(interface, f"test-{uuid.uuid4()}", 250_000)
+        link.open()
+        link.close()
+    assert bitrates == [250_000] * len(interfaces)
 
 
 def test_adapter_that_cannot_be_shut_down_is_closed() -> None:
