@@ -299,7 +299,7 @@ class NatNetClient(Resource):
                 self.alignment.add_echo(stamp * 1e-9, ticks, received_s)
             elif message_id == MessageId.MODELDEF and self._decoder is not None:
                 models = self.models = self._decoder.decode_models(payload)
-                self._schedule.models_outdated = False
+                self._schedule.note_models()
             elif message_id in (MessageId.RESPONSE, MessageId.UNRECOGNIZED_REQUEST):
                 is_answer = message_id == MessageId.RESPONSE
                 self._handle_response(messages.decode_integer_response(payload) if is_answer else None)
@@ -355,9 +355,10 @@ class NatNetClient(Resource):
             capture_s = self._capture_time(frame, received_s)
             self._is_recording = bool(frame.params & FRAME_RECORDING)
             has_restarted = self._statistics.restarts > restarts
-            has_gap = self._statistics.lost > lost  # a missing frame may have had the flag
-            if frame.params & FRAME_MODELS_CHANGED or has_gap or has_restarted:
+            if frame.params & FRAME_MODELS_CHANGED or has_restarted:
                 self._schedule.models_outdated = True
+            if self._statistics.lost > lost:
+                self._schedule.models_uncertain = True
         if has_restarted and self._on_models is not None:
             self._on_models(())
         if self._on_frame is not None:

@@ -20,20 +20,26 @@ MODE_PERIOD_S = 0.5
 class MessageSchedule:
     """Schedule of keep-alives, echoes, reconnects and requests for the server's mode and for changed models.
 
-    ``models_outdated`` is set by frames with the models-changed flag and by missing frames, which may have had it. It
-    is cleared when models arrive, so that a lost request is repeated and a further change is noticed.
+    ``models_outdated`` is set by frames with the models-changed flag, ``models_uncertain`` by missing frames, which may
+    have had it. Both are cleared when models arrive, so that a lost request is repeated and a further change is
+    noticed. Requests after missing frames do not delay the request after a flag.
     """
 
     def __init__(self, *, keepalives: bool) -> None:
-        self.models_outdated = False
+        self.models_outdated = self.models_uncertain = False
         self.reconnecting = False
         self._keepalives = keepalives
         self._next_keepalive_s = self._next_echo_s = self._next_models_s = self._next_mode_s = -math.inf
+        self._next_check_of_models_s = -math.inf
         self._next_connect_s = math.inf
 
     def note_frame(self, now_s: float) -> None:
         """Note a frame at ``now_s``."""
         self._next_connect_s = now_s + RECONNECT_PERIOD_S
+
+    def note_models(self) -> None:
+        """Note the arrival of models."""
+        self.models_outdated = self.models_uncertain = False
 
     def note_server_info(self, now_s: float) -> None:
         """Note an answer to CONNECT at ``now_s``."""
@@ -59,6 +65,9 @@ class MessageSchedule:
             messages.append(MessageId.CONNECT)
         if self.models_outdated and now_s >= self._next_models_s:
             self._next_models_s = now_s + MODELS_PERIOD_S
+            messages.append(MessageId.REQUEST_MODELDEF)
+        elif self.models_uncertain and now_s >= self._next_check_of_models_s:
+            self._next_check_of_models_s = now_s + MODELS_PERIOD_S
             messages.append(MessageId.REQUEST_MODELDEF)
         if polls_mode and now_s >= self._next_mode_s:
             self._next_mode_s = now_s + MODE_PERIOD_S

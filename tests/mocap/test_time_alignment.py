@@ -203,5 +203,15 @@ def test_models_are_requested_once_a_second_until_they_arrive() -> None:
     assert sent_in(schedule, 10.0, 11.0, has_clock=False, settled=True) == []
     schedule.models_outdated = True
     assert sent_in(schedule, 11.0, 13.995, has_clock=False, settled=True) == [MessageId.REQUEST_MODELDEF] * 3
-    schedule.models_outdated = False
+    schedule.note_models()
     assert sent_in(schedule, 14.0, 16.0, has_clock=False, settled=True) == []
+
+
+def test_request_after_missing_frames_does_not_delay_that_after_a_change() -> None:
+    schedule = MessageSchedule(keepalives=False)
+    schedule.models_uncertain = True
+    assert sent_in(schedule, 10.0, 11.495, has_clock=False, settled=True) == [MessageId.REQUEST_MODELDEF] * 2
+    schedule.models_outdated = True
+    assert schedule.due(11.5, has_clock=False, settled=True) == [MessageId.REQUEST_MODELDEF]
+    schedule.note_models()
+    assert sent_in(schedule, 11.51, 14.0, has_clock=False, settled=True) == []
