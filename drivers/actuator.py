@@ -53,6 +53,7 @@ class Actuator(Resource):
         self._number = 0
         self._armed_epoch = 0
         self._latched = ""  # fault known in the main process; it stays if the sender cannot be reached
+        self._unmeasured_cause = ""  # why the last measurement of the time-out was refused
 
     @property
     def is_open(self) -> bool:
@@ -69,7 +70,7 @@ class Actuator(Resource):
         if self._sender is not None:
             raise NotReadyError("This actuator was opened by another process", ("create a new Actuator after a fork.",))
         self._epoch = self._number = self._armed_epoch = 0
-        self._latched = ""
+        self._latched = self._unmeasured_cause = ""
         self._owner_pid = os.getpid()
         self._sender = self._start(self.config, self.calibration)
         atexit.register(self.close)
@@ -107,13 +108,15 @@ class Actuator(Resource):
     def measure_motor_timeout(self) -> None:
         """Send no command until the firmware releases the motor; ``health`` and ``problems`` have the result.
 
-        The motor is in neutral meanwhile. Has no effect unless the actuator is connected, disarmed and settled in
-        neutral, and the firmware reports the release. Raises NotOpenError, ActuatorFaultError.
+        The motor is in neutral meanwhile. Nothing is measured, and ``health`` has a warning, unless the actuator is
+        connected, disarmed and settled in neutral, and the firmware reports the release. Raises NotOpenError,
+        ActuatorFaultError.
         """
         self.require_no_fault()
         self._await(lambda s: s.is_neutral_settled, ANSWER_TIMEOUT_S)
         epoch = self._post_request(Request.MEASURE_TIMEOUT)
         status = self._await_epoch(epoch)
+        self._unmeasured_cause = status.refusal
         if status.refusal:
             return
 
@@ -232,6 +235,11 @@ class Actuator(Resource):
             warnings.append(
                 f"the {kind.name} stops the motor only {status.motor_timeout_s:.1f} s after the last command, if the "
                 f"computer or the cable fails; {kind.timeout_hint}"
+            )
+        if self._unmeasured_cause:
+            warnings.append(
+                f"the time-out of the {self.config.device_kind.name} was not measured: {self._unmeasured_cause} "
+                "Lift the wheels, pull the cable while they turn, and see that they stop."
             )
         device = self.config.device_kind.name.lower()
         readings = {

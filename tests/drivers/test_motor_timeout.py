@@ -16,7 +16,7 @@ from drivers.emulators.command_log import CommandLog
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.sender.logic import Order, Request, SenderLogic, SenderState
-from drivers.vesc.payloads import FirmwareVersion, MotorValues
+from drivers.vesc.payloads import Command, FirmwareVersion, MotorValues
 from tests.helpers.pauses import RunningTime
 from tests.helpers.waiting import TIMEOUT_S, until
 
@@ -70,6 +70,26 @@ def test_missing_timeout_is_a_problem_with_the_remedy() -> None:
         (problem,) = actuator.problems()
         assert problem.startswith("the VESC does not stop the motor within 2 s after the last command; set Timeout in")
         assert "vesc_time_to_motor_release_s" not in actuator.health().readings
+
+
+class Firmware5(VescFirmware):
+    """Firmware 5.2, which has no status byte at the end of its telemetry."""
+
+    def handle(self, payload: bytes, t_s: float) -> bytes | None:
+        reply = super().handle(payload, t_s)
+        return reply[:-1] if reply and reply[0] == Command.GET_VALUES_SELECTIVE else reply
+
+
+def test_timeout_that_the_firmware_does_not_report_is_a_warning() -> None:
+    old = Firmware5(CommandLog(), motor_timeout_s=math.inf)
+    old.version = FirmwareVersion(5, 2, "OLD", b"u" * 12)
+    with SerialFirmware(old) as firmware, connected(firmware) as actuator:
+        assert actuator.health().warnings == ()
+        actuator.measure_motor_timeout()
+        (warning,) = actuator.health().warnings
+        assert warning.startswith("the time-out of the VESC was not measured: the firmware does not report")
+        assert warning.endswith("pull the cable while they turn, and see that they stop.")
+        actuator.arm()
 
 
 def test_stop_of_another_thread_ends_the_measurement_with_neutral() -> None:
