@@ -57,8 +57,8 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, confusable_effects
 
 Progress = Callable[[str, float], None]
-SEARCH_PROGRESS = (0.05, 0.75)
-"""Progress at the start of the search, and share of the search."""
+SEARCH_PROGRESS = (0.05, 0.8)
+"""Progress at the start and at the end of the search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,12 +200,7 @@ def _search_effects(
     floor = mean_noise_floor(windows, noise, nominal)
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
     problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
-    start, search_share = SEARCH_PROGRESS
-
-    def search_progress(activity: str, share: float) -> None:
-        control.progress(activity, start + search_share * share)
-
-    search_control = replace(control, progress=search_progress)
+    search_control = control.part(*SEARCH_PROGRESS)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
     vibration = find_vibration(recordings.fit_segments)

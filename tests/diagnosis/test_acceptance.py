@@ -10,7 +10,7 @@ from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.candidates import acceptance, accepted, is_accepted
-from carlab.diagnosis.selection.elimination import Deletion, eliminate
+from carlab.diagnosis.selection.elimination import Deletion, EliminationResult, eliminate
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
@@ -88,8 +88,8 @@ def test_effect_remains_exactly_if_its_recorded_condition_holds(
 ) -> None:
     rise = problem.settings.selection.keep_z_min + offset
 
-    def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> dict[str, Deletion]:
-        return {name: Deletion(strong.fit, rise) for name in model.effects}
+    def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> EliminationResult:
+        return EliminationResult(model, {e: Deletion(replace(model, effects=(e,)), rise) for e in model.effects})
 
     monkeypatch.setattr("carlab.diagnosis.selection.elimination.delete_each", delete_each)
     named = ("aerodynamic_drag", "steering_lag")

@@ -48,7 +48,7 @@ def result(windows: PredictionWindows, car: SimulatorConfig) -> tuple[SearchProb
     problem = SearchProblem(replace(car, effects={}), windows, NOISE, NOISE, {}, (EFFECT,))
     base = fit_base(problem)
     free = problem.free_parameters((EFFECT,))
-    best = fit_with_scale(problem, (EFFECT,), problem.config_with((EFFECT,)), free, np.zeros(len(free)))
+    best = fit_with_scale(problem, (EFFECT,), np.zeros(len(free)))
     return problem, SearchResult(base.fit, best.fit, (EFFECT,), {}, {}, (), (), best.scale)
 
 

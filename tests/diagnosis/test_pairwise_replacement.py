@@ -32,7 +32,7 @@ def test_two_effects_that_fit_equally_well_do_not_replace_one_another_again_and_
         return PairwiseResult(replacements={name: Candidate(other, base.fit, 1.0)})
 
     monkeypatch.setattr(pairwise_tests, "compare_pairs", compare)
-    monkeypatch.setattr(pairwise_tests, "delete_each", lambda *_: {})
+    monkeypatch.setattr(pairwise_tests, "delete_each", lambda _, model, control: EliminationResult(model, {}))
     monkeypatch.setattr(pairwise_tests, "refit", lambda _, effects, fit, scale: Model(effects, fit, scale))
     effects = (DELAY, "motor_lag", "steering_lag", "load_transfer")
     model, _ = choose_confusable(problem, EliminationResult(Model(effects, base.fit, base.scale), {}), RunControl())

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from carlab.diagnosis.decisions import Decision
-from carlab.diagnosis.selection.delay_groups import confusable_shared_delays
-from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
+from carlab.diagnosis.selection.elimination import delete_each
 from carlab.diagnosis.selection.pairwise_tests import compare_pairs
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_base, fit_with_scale
-from carlab.diagnosis.selection.shared_delays import replace_shared_delays
+from carlab.diagnosis.selection.shared_delays import confusable_shared_delays, replace_shared_delays
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
@@ -32,7 +31,7 @@ def fitted(true: dict[str, float], accepted: tuple[str, ...]) -> tuple[SearchPro
     base = fit_base(problem)
     free = problem.free_parameters(accepted)
     start = np.concatenate([base.fit.z, [f.coordinate(0.03) for f in free[len(base.fit.z) :]]])
-    return problem, fit_with_scale(problem, accepted, problem.config_with(accepted), free, start)
+    return problem, fit_with_scale(problem, accepted, start)
 
 
 @pytest.mark.parametrize(
@@ -52,8 +51,7 @@ def test_delays_and_lags_are_exchanged(true: dict[str, float], accepted: tuple[s
     problem, model = fitted(true, accepted)
     decisions: list[Decision] = []
     control = RunControl(record=decisions.append)
-    eliminated = EliminationResult(model, delete_each(problem, model, control))
-    outcome = replace_shared_delays(problem, eliminated, control).model
+    outcome = replace_shared_delays(problem, delete_each(problem, model, control), control).model
     assert set(outcome.effects) == expected
     passed = {decision.effect for decision in decisions if decision.stage == "replace" and decision.passed}
     assert passed >= expected or expected == set(accepted)
@@ -69,7 +67,7 @@ def test_shared_delay_is_compared_with_the_shorter_of_two_lags() -> None:
     problem, model = fitted({DELAY: 0.004, "steering_lag": 0.05}, ("steering_lag", "motor_lag"))
     assert ("motor_lag", DELAY) in confusable_shared_delays(model)
     control = RunControl()
-    pairs = compare_pairs(problem, EliminationResult(model, delete_each(problem, model, control)), control)
+    pairs = compare_pairs(problem, delete_each(problem, model, control), control)
     assert DELAY in pairs.indistinguishable["motor_lag"]
     assert DELAY not in pairs.indistinguishable["steering_lag"]
     with_delay = fitted({DELAY: 0.004, "steering_lag": 0.05}, (DELAY, "steering_lag"))[1]

@@ -88,7 +88,7 @@ def compared_groups(
     problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), ())
     base = base_parameters(nominal)
     free = (*base, *(f for name in stated_effects(nominal) for f in effect_parameters(name, nominal)))
-    fitted = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
+    fitted = fit_with_scale(problem, (), problem.nominal_coordinates(free), free)
     one, two = (
         Fitter(w.thinned(limit), fitted.scale) for w, limit in zip((first, second), COMPARISON.max_windows, strict=True)
     )

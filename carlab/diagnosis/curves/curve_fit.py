@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import RejectedCurves
-from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.fit_parameters import numbers_at
 from carlab.diagnosis.identification.gains import clustered_gain
@@ -57,7 +55,7 @@ def fit_curves(
     scale = problem.scale_of(fit.config)
     named = _effects_with(problem, found, ())
     reference = _fit(problem, named, found.best.coordinates(), settings.first_iterations, settings.last_iterations)
-    losses = [_left_out_loss(problem, each, scale) for each in (reference, fit)]
+    losses = [problem.left_out_loss(each, scale) for each in (reference, fit)]
     gain, error = clustered_gain(losses[0], losses[1], problem.windows)
     log.info("measured curves %s: gain on left-out blocks %.1f standard errors", ", ".join(curves), gain / error)
     if gain < settings.accept_z_min * error:
@@ -101,7 +99,7 @@ def _eliminate(
     """
     settings = problem.settings.curves
     scale = problem.scale_of(fit.config)
-    loss = _left_out_loss(problem, fit, scale)
+    loss = problem.left_out_loss(fit, scale)
     rejected: list[RejectedCurves] = []
     for k, name in enumerate(reversed(curves)):
         if control.stop():
@@ -109,16 +107,10 @@ def _eliminate(
         control.progress(f"measured curves without {EFFECTS[name].class_statement}", 0.3 + 0.06 * k)
         others = tuple(c for c in curves if c != name)
         without = _fit(problem, (*effects, *others), fit.coordinates(), settings.last_iterations)
-        loss_without = _left_out_loss(problem, without, scale)
+        loss_without = problem.left_out_loss(without, scale)
         rise, error = clustered_gain(loss_without, loss, problem.windows)
         log.info("without %s: the loss on left-out blocks rises by %.1f standard errors", name, rise / error)
         if rise < settings.keep_z_min * error:
             fit, curves, loss = without, others, loss_without
             rejected.append(RejectedCurves((name,), rise / error, settings.keep_z_min))
     return fit, curves, tuple(rejected)
-
-
-def _left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
-    """Loss of each window (S,) by a fit without its block."""
-    limit = problem.settings.selection.max_left_out_error
-    return problem.fitter(scale).leave_fold_out_loss(fit, problem.folds(), limit)

@@ -12,7 +12,6 @@ import logging
 
 from carlab.diagnosis.decisions import Alternatives, Condition
 from carlab.diagnosis.identification.gains import clustered_gain
-from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.rival_physics import RivalPhysics
@@ -61,7 +60,8 @@ def curve_in_addition(problem: SearchProblem, found: SearchResult, curve: str, n
 
 def _limits(problem: SearchProblem, found: SearchResult, rival: RivalPhysics) -> Alternatives:
     """Conditions on the gain of the curve beyond that of the named effects."""
-    base, own, with_curve = (left_out_loss(problem, fit, found.scale) for fit in (found.base, found.best, rival.fit))
+    fits = (found.base, found.best, rival.fit)
+    base, own, with_curve = (problem.left_out_loss_of_free_states(fit, found.scale) for fit in fits)
     gain, error = clustered_gain(own, with_curve, problem.windows)
     total = float((base - with_curve).sum())
     share = gain / total if total > 0.0 else 0.0

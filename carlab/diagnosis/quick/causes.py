@@ -151,8 +151,7 @@ def _fit_singles(fitter: Fitter, simulator: SimulatorConfig) -> list[_Candidate]
     screen = Screen(fitter, simulator, fitter.fit(simulator, ()), QUICK.screened_windows)
     screened: list[tuple[float, str, SimulatorConfig, tuple[FitParameter, ...], FloatArray]] = []
     for name in _new_effects(simulator):
-        free = effect_parameters(name, simulator)
-        result = screen.score(name, free)
+        free, result = effect_parameters(name, simulator), screen.score(name)
         screened.append((result.score, name, with_effect(simulator, name), free, result.starts))
     for name, free in _simulator_parameters(simulator):
         score, start = _screen_parameters(screen, simulator, free)
@@ -186,7 +185,7 @@ def _fit_with_refit(fitter: Fitter, simulator: SimulatorConfig) -> tuple[_Candid
     free = (*base_parameters(simulator), *own)
     refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=QUICK.fit_iterations)
     screen = Screen(fitter, simulator, refit, QUICK.screened_windows)
-    screened = [screen.score(name, effect_parameters(name, simulator)) for name in _new_effects(simulator)]
+    screened = [screen.score(name) for name in _new_effects(simulator)]
     screened.sort(key=lambda result: -result.score)
     found = []
     for result in screened[: QUICK.max_additional_fits]:

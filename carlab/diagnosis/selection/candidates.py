@@ -10,12 +10,11 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision, passes
-from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import begin_refit, finish_refit
@@ -41,8 +40,7 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     begun = _fitted(begin_refit, problem, model, chosen, _step(problem, model, control, 0.0, 0.3))
     if not begun:
         return ()
-    max_error = problem.settings.selection.max_left_out_error
-    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), max_error, linearisation)
+    reference = problem.left_out_loss(model.fit, model.scale, linearisation)
     found: tuple[Candidate, ...] = ()
     groups = _first_and_waiting(problem, model, begun)
     for group, (first, middle, last) in zip(groups, ((0.3, 0.6, 0.7), (0.7, 0.9, 1.0)), strict=True):
@@ -72,11 +70,7 @@ def _first_and_waiting(
 def _step(problem: SearchProblem, model: Model, control: RunControl, first: float, last: float) -> RunControl:
     """The control of a part of the step that adds an effect, from ``first`` to ``last`` as shares of the step."""
     done, steps = len(model.effects), problem.settings.selection.max_effects
-
-    def progress(activity: str, share: float) -> None:
-        control.progress(activity, (done + first + (last - first) * share) / steps)
-
-    return replace(control, progress=progress)
+    return control.part((done + first) / steps, (done + last) / steps)
 
 
 def _fitted(
@@ -89,7 +83,7 @@ def _fitted(
     """Fits of candidates by the workers; fewer if the search is to end."""
     fitted = control.workers.map(
         refit,
-        [(problem.without_refits(), model, item) for item in items],
+        [(problem, model, item) for item in items],
         stop=control.ends_search,
         started=lambda k: control.progress(f"refitting with {items[k].effect}", k / len(items)),
     )
@@ -117,13 +111,12 @@ def _tested(
 ) -> tuple[Candidate, ...]:
     """Test the candidates with the largest gains on left-out blocks; ``reference`` (S,) is the loss of the model."""
     settings = problem.settings.selection
-    fitter = problem.fitter(model.scale)
     by_gain = sorted(refitted, key=lambda c: -c.gain)
     min_gain = settings.min_gain_share * by_gain[0].gain if by_gain else 0.0
     new = [c for k, c in enumerate(by_gain) if (c.gain >= min_gain or k < 2) and not c.is_tested]
     tested = control.workers.map(
         with_left_out_gain,
-        [(problem.without_refits(), fitter, candidate, reference) for candidate in new],
+        [(problem, model.scale, candidate, reference) for candidate in new],
         stop=control.ends_search,
         started=lambda k: control.progress(f"cross-validating {new[k].effect}", k / len(new)),
     )
@@ -135,14 +128,12 @@ def _tested(
     return tuple(sorted(found, key=lambda c: (not c.is_tested, -(c.gain + c.left_out_gain))))
 
 
-def with_left_out_gain(
-    problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray
-) -> Candidate:
+def with_left_out_gain(problem: SearchProblem, scale: Scale, candidate: Candidate, reference: FloatArray) -> Candidate:
     """The candidate with its chi2 and with its gain over ``reference`` (S,) on left-out blocks."""
+    fitter = problem.fitter(scale)
     linearisation = fitter.linearised(candidate.fit)
     fit = fitter.with_covariance(candidate.fit, linearisation)
-    limit = problem.settings.selection.max_left_out_error
-    loss = fitter.leave_fold_out_loss(fit, problem.folds(), limit, linearisation)
+    loss = problem.left_out_loss(fit, scale, linearisation)
     gain, error = clustered_gain(reference, loss, problem.windows)
     chi2 = 2.0 * candidate.gain / design_effect_of(fit, candidate.effect)
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)

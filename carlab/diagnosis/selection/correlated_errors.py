@@ -8,40 +8,26 @@ little. An effect that does not lower the loss on left-out blocks significantly 
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 
 import numpy as np
 
-from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.error_model import ErrorModel
 from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.selection.elimination import delete_each
+from carlab.diagnosis.selection.elimination import eliminate
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.search import restrict
 
-log = logging.getLogger(__name__)
-
 
 def without_unsupported_effects(problem: SearchProblem, found: SearchResult, control: RunControl) -> SearchResult:
     """The result without effects that decorrelated errors do not support; unchanged if the simulator has no error."""
-    settings = problem.settings.selection
-    excess = float(np.mean((found.scale.sigma / problem.floor) ** 2)) - 1.0
-    if not found.effects or excess < settings.min_model_error:
+    if not found.effects or problem.excess_of(found.scale) < problem.settings.selection.min_model_error:
         return found
     model = refit(problem, found.effects, found.best, decorrelating(problem, found.model))
-    while model.effects and not control.stop():
-        deletions = delete_each(problem, model, control)
-        weakest = min(deletions, key=lambda name: deletions[name].standard_errors)
-        condition = Condition("selection.supported_z_min", deletions[weakest].standard_errors, settings.supported_z_min)
-        control.record(Decision("support", weakest, ((condition,),), condition.holds, len(model.effects)))
-        if condition.holds:
-            break
-        log.info("removed %s: %.1f standard errors with decorrelated errors", weakest, condition.statistic)
-        remaining = tuple(e for e in model.effects if e != weakest)
-        model = Model(remaining, deletions[weakest].without, model.scale)
-    return found if model.effects == found.effects else restrict(problem, found, model.effects, control)
+    result = eliminate(problem, model, control, stage="support", setting="supported_z_min", min_effects=0)
+    supported = result.model.effects
+    return found if supported == found.effects else restrict(problem, found, supported, control)
 
 
 def decorrelating(problem: SearchProblem, model: Model) -> Scale:

@@ -25,7 +25,7 @@ from carlab.diagnosis.settings import RESTARTS
 
 log = logging.getLogger(__name__)
 
-ALTERNATIVES_PROGRESS = 0.9
+ALTERNATIVES_PROGRESS = (0.9, 0.9)
 """Progress of the search while other choices are followed."""
 
 
@@ -93,7 +93,7 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
             break
         names = (*choice.path.model.effects, choice.candidate.effect)
         log.info("alternative %d of %d: %s", k + 1, len(choices), ", ".join(names))
-        labelled = _labelled(control, f"alternative {k + 1} of {len(choices)}")
+        labelled = control.part(*ALTERNATIVES_PROGRESS, f"alternative {k + 1} of {len(choices)}: ")
         path = extend(problem, _add(problem, choice.path, (choice.candidate,), labelled), labelled, visited)
         is_new = _effects(path) not in visited
         visited |= path.visited
@@ -122,7 +122,7 @@ def _distinct(choices: Sequence[Choice], same_loss_share: float) -> list[Choice]
 
 def remaining_excess(problem: SearchProblem, base: Model, model: Model) -> float:
     """Share of the squared excess of the refitted base model that a model leaves, from the scales of their errors."""
-    excess, excess_base = (max(float(np.mean((m.scale.sigma / problem.floor) ** 2)) - 1.0, 0.0) for m in (model, base))
+    excess, excess_base = (max(problem.excess_of(m.scale), 0.0) for m in (model, base))
     return excess / excess_base if excess_base > 0.0 else 0.0
 
 
@@ -130,7 +130,7 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     """The path with the first of the accepted candidates added."""
     leader, before = chosen[0], path.model
     log.info("accepted %s", leader.effect)
-    added = fit_with_scale(problem, (*before.effects, leader.effect), leader.fit.config, leader.fit.free, leader.fit.z)
+    added = fit_with_scale(problem, (*before.effects, leader.effect), leader.fit.z)
     restarted, failed_restarts = _restarted(problem, added, path.failed_restarts, control)
     model = apply_moves(problem, restarted, control)
     confusable = problem.confusable.get(leader.effect, ())
@@ -157,22 +157,9 @@ def _effects(path: Path) -> frozenset[str]:
     return frozenset(path.model.effects)
 
 
-def _labelled(control: RunControl, label: str) -> RunControl:
-    """The control with a label before each activity, at a constant share of the progress."""
-
-    def progress(activity: str, share: float) -> None:
-        control.progress(f"{label}: {activity}", ALTERNATIVES_PROGRESS)
-
-    return replace(control, progress=progress)
-
-
 def _is_better(problem: SearchProblem, model: Model, reference: Model) -> bool:
     """Whether a model predicts left-out blocks significantly better than the reference, with the reference's scale."""
-    settings = problem.settings.selection
-    fitter = problem.fitter(reference.scale)
-    loss, reference_loss = (
-        fitter.leave_fold_out_loss(m.fit, problem.folds(), settings.max_left_out_error) for m in (model, reference)
-    )
+    loss, reference_loss = (problem.left_out_loss(m.fit, reference.scale) for m in (model, reference))
     gain, error = clustered_gain(reference_loss, loss, problem.windows)
     log.info("gain on left-out blocks of the alternative: %.1f (%.1f standard errors)", gain, gain / error)
-    return gain > settings.tie_z * error
+    return gain > problem.settings.selection.tie_z * error

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.gains import design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import fit_with_scale, refit_candidate, refit_without_each
@@ -31,8 +30,7 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
             if swapped is not None:
                 return swapped
             log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
-            config = problem.config_with(reduced.effects)
-            smaller = fit_with_scale(problem, reduced.effects, config, reduced.fit.free, reduced.fit.z)
+            smaller = fit_with_scale(problem, reduced.effects, reduced.fit.z)
             return apply_moves(problem, smaller, control)
         significant[name] = reduced
     return _swap(problem, model, significant, control) or model
@@ -59,16 +57,14 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     ]
     if not pairs or control.ends_search():
         return None
-    without_refits = problem.without_refits()
     screens = {name: screen_of(problem, reduced[name]) for name in dict(pairs)}
-    arguments = [(without_refits, model, reduced[name], screens[name], other) for name, other in pairs]
+    arguments = [(problem, model, reduced[name], screens[name], other) for name, other in pairs]
     swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
     for (name, _), swap in zip(pairs, swaps, strict=True):
         if swap is not None and swap[1] > settings.keep_chi2_min + _additional_chi2(problem, swap[0].effect, name):
             candidate, chi2 = swap
             log.info("%s replaces %s (chi2 %.1f)", candidate.effect, name, chi2)
-            fit, effects = candidate.fit, (*reduced[name].effects, candidate.effect)
-            return fit_with_scale(problem, effects, fit.config, fit.free, fit.z)
+            return fit_with_scale(problem, (*reduced[name].effects, candidate.effect), candidate.fit.z)
     return None
 
 
@@ -85,7 +81,7 @@ def _fitted_swap(
 
     None if its screening score is too small a share of the gain of the effect that ``reduced`` lacks.
     """
-    screened = screen.score(other, effect_parameters(other, problem.nominal))
+    screened = screen.score(other)
     if screened.score < problem.settings.selection.swap_score_share * (reduced.fit.cost - model.fit.cost):
         return None
     candidate = refit_candidate(problem, reduced, screened)

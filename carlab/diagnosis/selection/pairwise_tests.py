@@ -12,16 +12,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.identification.fit import Fit, Linearisation
-from carlab.diagnosis.identification.fit_parameters import effect_parameters
-from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
-from carlab.diagnosis.selection.delay_groups import confusable_shared_delays
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
 from carlab.diagnosis.selection.screening import screen_of
+from carlab.diagnosis.selection.shared_delays import confusable_shared_delays
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +56,7 @@ def choose_confusable(
         before = eliminated.model
         effects = tuple(candidate.effect if e == name else e for e in before.effects)
         model = refit(problem, effects, candidate.fit, before.scale)
-        eliminated = EliminationResult(model, delete_each(problem, model, control))
+        eliminated = delete_each(problem, model, control)
         pairs = compare_pairs(problem, eliminated, control)
     return eliminated.model, pairs
 
@@ -73,11 +69,11 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
     fitter = problem.fitter(model.scale)
     linearisation = fitter.linearised(model.fit)
     with_covariance = fitter.with_covariance(model.fit, linearisation)
-    own_loss = left_out_loss(problem, model.fit, model.scale, linearisation)
+    own_loss = problem.left_out_loss_of_free_states(model.fit, model.scale, linearisation)
     fitted = _fitted_alternatives(problem, eliminated, control)
     chi2, indistinguishable, replacements = {}, {}, {}
     for name in model.effects:
-        gain = eliminated.deletions[name].without.cost - model.fit.cost
+        gain = eliminated.deletions[name].without.fit.cost - model.fit.cost
         chi2[name] = 2.0 * gain / design_effect_of(with_covariance, name)
         compared = []
         for candidate, loss in fitted[name]:
@@ -110,7 +106,7 @@ def _fitted_alternatives(
     ]
     fitted = control.workers.map(
         _fitted_alternative,
-        [(problem.without_refits(), model, eliminated.deletions[name].without, name, other) for name, other in pairs],
+        [(problem, model, eliminated.deletions[name].without, other) for name, other in pairs],
         stop=control.stop,
         started=lambda k: control.progress(f"comparing {pairs[k][0]} with {pairs[k][1]}", 0.95),
     )
@@ -122,29 +118,13 @@ def _fitted_alternatives(
 
 
 def _fitted_alternative(
-    problem: SearchProblem, model: Model, without: Fit, name: str, other: str
+    problem: SearchProblem, model: Model, without: Model, other: str
 ) -> tuple[Candidate, FloatArray] | None:
-    """Fit ``other`` in place of ``name``, with its loss on left-out blocks (S,); None if it explains too little."""
-    reduced = Model(tuple(e for e in model.effects if e != name), without, model.scale)
-    screened = screen_of(problem, reduced).score(other, effect_parameters(other, problem.nominal))
-    candidate = refit_candidate(problem, reduced, screened)
-    if candidate.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
-        return None
-    return candidate, left_out_loss(problem, candidate.fit, model.scale)
+    """Add ``other`` to a model ``without`` an effect of ``model``, with its loss on left-out blocks (S,).
 
-
-def left_out_loss(
-    problem: SearchProblem, fit: Fit, scale: Scale, linearisation: Linearisation | None = None
-) -> FloatArray:
-    """Loss of each window (S,) by a fit without its fold, with free initial states.
-
-    ``linearisation`` is that of the errors at the fit; computed by default.
+    None if it explains too little.
     """
-    return loss_of_free_initial_states(
-        problem.windows,
-        fit.config,
-        fit.free,
-        problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds(), linearisation),
-        problem.measured_std,
-        max_error=problem.settings.selection.max_left_out_error,
-    )
+    candidate = refit_candidate(problem, without, screen_of(problem, without).score(other))
+    if candidate.gain < problem.settings.selection.min_gain_share * (without.fit.cost - model.fit.cost):
+        return None
+    return candidate, problem.left_out_loss_of_free_states(candidate.fit, model.scale)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Decision, passes
 from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.identification.fit import Fit, Fitter
+from carlab.diagnosis.identification.fit import Fit, Fitter, Linearisation
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,
@@ -19,6 +20,7 @@ from carlab.diagnosis.identification.fit_parameters import (
     tyre_effects,
     with_effect,
 )
+from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION, DiagnosisSettings
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.errors import prediction_errors
@@ -50,9 +52,9 @@ class SearchProblem:
     settings: DiagnosisSettings = DEFAULT
     refits: dict[Hashable, Model] = field(init=False, default_factory=dict, compare=False, repr=False)
 
-    def without_refits(self) -> SearchProblem:
-        """The same problem without its earlier refits, which another process does not need."""
-        return replace(self)
+    def __reduce__(self) -> tuple[type[SearchProblem], tuple[Any, ...]]:
+        """Pickle without earlier refits, which another process does not need."""
+        return SearchProblem, tuple(getattr(self, f.name) for f in fields(self) if f.init)
 
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
         """Free parameters of a fit with ``effects``."""
@@ -98,6 +100,23 @@ class SearchProblem:
         blocks = np.unique(self.windows.block)
         count = min(self.settings.selection.folds, max(len(blocks), 1))
         return np.asarray(np.searchsorted(blocks, self.windows.block) % count)
+
+    def left_out_loss(self, fit: Fit, scale: Scale, linearisation: Linearisation | None = None) -> FloatArray:
+        """Loss of each window (S,) by a fit without its fold; ``linearisation`` as in ``Fitter``."""
+        limit = self.settings.selection.max_left_out_error
+        return self.fitter(scale).leave_fold_out_loss(fit, self.folds(), limit, linearisation)
+
+    def left_out_loss_of_free_states(
+        self, fit: Fit, scale: Scale, linearisation: Linearisation | None = None
+    ) -> FloatArray:
+        """Loss as ``left_out_loss``, at the initial state of each window that minimises it."""
+        z = self.fitter(scale).leave_fold_out_coordinates(fit, self.folds(), linearisation)
+        limit = self.settings.selection.max_left_out_error
+        return loss_of_free_initial_states(self.windows, fit.config, fit.free, z, self.measured_std, max_error=limit)
+
+    def excess_of(self, scale: Scale) -> float:
+        """Mean squared error of a model with this scale in noise floors, less that of a perfect simulator."""
+        return float(np.mean((scale.sigma / self.floor) ** 2)) - 1.0
 
     def perfect_loss(self) -> float:
         """Expected loss of a perfect simulator: one half for each whitened error."""
@@ -204,6 +223,14 @@ class RunControl:
     omit: Callable[[str], None] = lambda stage: None
     ends_search: Callable[[], bool] = lambda: False
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
+
+    def part(self, first: float, last: float, label: str = "") -> RunControl:
+        """The control of a part of the run, between two shares of it; ``label`` precedes its activities."""
+
+        def progress(activity: str, share: float) -> None:
+            self.progress(f"{label}{activity}", first + (last - first) * share)
+
+        return replace(self, progress=progress)
 
     def are_confirmed(self, effects: Sequence[str], alternatives: Alternatives, count: int) -> bool:
         """Whether one of the alternatives holds for accepted effects (of ``count``); records this for each of them."""

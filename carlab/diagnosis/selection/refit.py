@@ -13,7 +13,6 @@ from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, values_at
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
-from sim_backends.car_parameters import SimulatorConfig
 
 
 def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale: Scale) -> Model:
@@ -47,7 +46,7 @@ def refit_without_each(
     new = [name for name in removed if keys[name] not in problem.refits]
     fitted = control.workers.map(
         _fit_from,
-        [(problem.without_refits(), others[name], starts[name], model.scale, cost) for name in new],
+        [(problem, others[name], starts[name], model.scale, cost) for name in new],
         started=lambda k: control.progress(f"refitting without {new[k]}", 0.93),
     )
     problem.refits.update((keys[name], each) for name, each in zip(new, fitted, strict=True) if each is not None)
@@ -133,22 +132,14 @@ def _distinct_starts(own: Sequence[FitParameter], starts: FloatArray, limit_rati
 
 
 def fit_with_scale(
-    problem: SearchProblem,
-    effects: tuple[str, ...],
-    config: SimulatorConfig,
-    free: tuple[FitParameter, ...],
-    start: FloatArray,
+    problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, free: tuple[FitParameter, ...] | None = None
 ) -> Model:
-    """Alternate fits and estimates of the error scale until the scale converges.
+    """Alternate fits with ``effects`` and estimates of the error scale until the scale converges.
 
-    Args:
-        problem: the search problem.
-        effects: ids of the effects in ``config``, for the result.
-        config: simulator with the effects.
-        free: n parameters to fit.
-        start: their coordinates (n,) at the start.
+    The fits begin at coordinates ``start`` (n,) of the parameters ``free``, by default those of the problem.
     """
-    settings = problem.settings.selection
+    settings, config = problem.settings.selection, problem.config_with(effects)
+    free = problem.free_parameters(effects) if free is None else free
     scale = problem.scale_of(config, values_at(free, start))
     for _ in range(settings.scale_iterations):
         fit = problem.fitter(scale).fit(config, free, start)
@@ -161,5 +152,4 @@ def fit_with_scale(
 
 def fit_base(problem: SearchProblem) -> Model:
     """Fit the base parameters alone."""
-    free = problem.free_parameters(())
-    return fit_with_scale(problem, (), problem.nominal, free, problem.nominal_coordinates(free))
+    return fit_with_scale(problem, (), problem.nominal_coordinates(problem.free_parameters(())))

@@ -22,8 +22,7 @@ log = logging.getLogger(__name__)
 
 def needs_restart(problem: SearchProblem, model: Model) -> bool:
     """Whether a model has several effects and does not reach the noise."""
-    excess = float(np.mean((model.scale.sigma / problem.floor) ** 2)) - 1.0
-    return excess >= RESTARTS.min_model_error and len(model.effects) >= RESTARTS.min_effects
+    return problem.excess_of(model.scale) >= RESTARTS.min_model_error and len(model.effects) >= RESTARTS.min_effects
 
 
 def restart(problem: SearchProblem, model: Model, control: RunControl) -> Model:
@@ -37,7 +36,7 @@ def restart(problem: SearchProblem, model: Model, control: RunControl) -> Model:
     log.info("restarts of %s: cost %.1f, %.1f before", ", ".join(model.effects), best.cost, model.fit.cost)
     if best.cost > (1.0 - RESTARTS.min_fall_share) * model.fit.cost:
         return model
-    return fit_with_scale(problem, model.effects, config, free, best.z)
+    return fit_with_scale(problem, model.effects, best.z)
 
 
 def _perturbed(model: Model) -> FloatArray:

@@ -88,5 +88,5 @@ def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float, contr
     names = [e.id for e in rivals if e.id not in problem.nominal.effects]
     screened = [result for result in screen_candidates(problem, model, names, control) if result.score > min_score]
     chosen = screened[: problem.settings.rivals.max_refits]
-    fitted = control.workers.map(refit_candidate, [(problem.without_refits(), model, result) for result in chosen])
+    fitted = control.workers.map(refit_candidate, [(problem, model, result) for result in chosen])
     return [candidate for candidate in fitted if candidate is not None]

@@ -79,15 +79,15 @@ class Screen:
         weighted = self.weight * change.reshape(-1)
         return np.asarray(weighted - self._inside @ (self._inside.T @ weighted))
 
-    def score(self, effect: str, free: Sequence[FitParameter]) -> ScreeningResult:
+    def score(self, effect: str) -> ScreeningResult:
         """Score of a candidate: the maximum over its sizes, signs and places."""
-        settings = self.settings
+        settings, free = self.settings, effect_parameters(effect, self.config)
         config = with_effect(self.config, effect)
         points = self.points(effect, free)
         gains = np.full(len(points), -math.inf)
         along = np.zeros(len(points))
         for part in np.array_split(np.arange(len(points)), max(1, math.ceil(len(points) / settings.batch_size))):
-            for k, moved in zip(part, self._moved(config, tuple(free), points[part]), strict=True):
+            for k, moved in zip(part, self._moved(config, free, points[part]), strict=True):
                 gains[k], along[k] = self.gain(moved)
         order = np.argsort(-gains)[: settings.max_starts]
         order = order[gains[order] >= settings.min_start_score_share * gains[order[0]]]
@@ -236,5 +236,5 @@ def screen_candidates(
 ) -> tuple[ScreeningResult, ...]:
     """Screening scores of effects added to a model, the highest first."""
     screen = screen_of(problem, model)
-    scored = control.workers.map(screen.score, [(name, effect_parameters(name, problem.nominal)) for name in names])
+    scored = control.workers.map(screen.score, [(name,) for name in names])
     return tuple(sorted((each for each in scored if each is not None), key=lambda result: -result.score))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from carlab.diagnosis.selection.elimination import EliminationResult, delete_each, eliminate
+from carlab.diagnosis.selection.elimination import delete_each, eliminate
 from carlab.diagnosis.selection.forward import Path, best_path, extend
 from carlab.diagnosis.selection.pairwise_tests import choose_confusable, compare_pairs
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
@@ -58,7 +58,7 @@ def restrict(problem: SearchProblem, found: SearchResult, names: tuple[str, ...]
 
 def with_model(problem: SearchProblem, found: SearchResult, model: Model, control: RunControl) -> SearchResult:
     """The result with a fit of some of its effects."""
-    pairs = compare_pairs(problem, EliminationResult(model, delete_each(problem, model, control)), control)
+    pairs = compare_pairs(problem, delete_each(problem, model, control), control)
     return replace(
         found,
         best=model.fit,

@@ -4,6 +4,8 @@ A lag of the steering and a lag of the motor of similar size resemble one delay 
 adds one effect at a time, so it finds the delay first. The delay then hides the two lags, or stays beside one of them.
 Here all effects of delays and lags are replaced together by each set with at most one of them for each command. A delay
 or lag of each command is also compared with a delay of both and a further delay or lag of one command.
+
+An effect that delays both commands names its groups (``Effect.split_into``): the delays and lags of each command.
 """
 
 from __future__ import annotations
@@ -18,9 +20,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
-from carlab.diagnosis.selection.delay_groups import effect_of_each_command, group_lags_s
 from carlab.diagnosis.selection.elimination import EliminationResult, eliminate
-from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import SelectionSettings
@@ -54,9 +54,9 @@ def replace_shared_delays(
         if not exchanges or control.stop():
             continue
         control.progress(f"comparing {name} with delays and lags of single commands", 0.94)
-        arguments = [(problem.without_refits(), model, *exchange) for exchange in exchanges]
+        arguments = [(problem, model, *exchange) for exchange in exchanges]
         fitted = [each for each in control.workers.map(_fitted, arguments, stop=control.stop) if each is not None]
-        own_loss = left_out_loss(problem, model.fit, model.scale) if fitted else np.zeros(0)
+        own_loss = problem.left_out_loss_of_free_states(model.fit, model.scale) if fitted else np.zeros(0)
         passing = [each for each in fitted if _passes(problem, model, each, own_loss, control)]
         if passing:
             best = min(passing, key=lambda each: float(each.loss.sum()))
@@ -116,7 +116,7 @@ def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict
     chi2 = 2.0 * (model.fit.cost - fit.cost) / max(design_effect_of(with_covariance, e) for e in new)
     if chi2 < (settings.accept_chi2_min if len(new) > len(old) else -settings.accept_chi2_min):
         return None
-    return _Replacement(old, tuple(new), fit, chi2, left_out_loss(problem, fit, model.scale))
+    return _Replacement(old, tuple(new), fit, chi2, problem.left_out_loss_of_free_states(fit, model.scale))
 
 
 def _passes(
@@ -151,3 +151,36 @@ def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings
     if len(replacement.new) == len(replacement.old):
         return (Condition("selection.replace_z_min", z, settings.replace_z_min),)
     return (Condition("selection.keep_z_min", -z, settings.keep_z_min, above=False),)
+
+
+def lag_s(model: Model, name: str) -> float:
+    """Delay or time constant of an accepted effect [s], relative to the car file."""
+    parameter = f"effects.{name}.{EFFECTS[name].lag_parameter}"
+    return next(
+        float(f.value(z)) - f.origin for f, z in zip(model.fit.free, model.fit.z, strict=True) if f.name == parameter
+    )
+
+
+def group_lags_s(model: Model, name: str) -> list[float]:
+    """Sum of the effect's own delay and of the delays and lags of each group [s], relative to the car file."""
+    return [sum(lag_s(model, e) for e in (name, *group) if e in model.effects) for group in EFFECTS[name].split_into]
+
+
+def effect_of_each_command(model: Model, name: str) -> tuple[str, ...]:
+    """The accepted delay or lag of each group of ``name``, the shorter one first.
+
+    Empty if a group has none or several, or if an accepted effect already delays both commands.
+    """
+    old = [[e for e in group if e in model.effects] for group in EFFECTS[name].split_into]
+    if any(len(each) != 1 for each in old) or any(EFFECTS[e].split_into for e in model.effects):
+        return ()
+    return tuple(sorted((each[0] for each in old), key=lambda e: lag_s(model, e)))
+
+
+def confusable_shared_delays(model: Model) -> list[tuple[str, str]]:
+    """Pairs of an accepted delay or lag of one command and a delay of both commands that may replace it.
+
+    A delay of both commands replaces the shorter of two delays or lags; the longer one becomes shorter by it.
+    """
+    shared = (name for name, effect in EFFECTS.items() if effect.split_into)
+    return [(found[0], name) for name in shared if (found := effect_of_each_command(model, name))]
