@@ -84,11 +84,7 @@ def compare(
     faults_of_files = tuple(fault for group in groups for fault in group.faults)
     found = replace(found, data_faults=(*faults_of_files, *found.data_faults))
     if out is not None:
-        _save(found, Path(out))
+        with writing(folder := Path(out)):
+            make_folder(folder)
+        write_json(folder / FILE_NAME, found.to_dict())
     return found
-
-
-def _save(found: Comparison, folder: Path) -> None:
-    with writing(folder):
-        make_folder(folder)
-    write_json(folder / FILE_NAME, found.to_dict())

@@ -203,7 +203,11 @@ def _read_recordings(
 ) -> tuple[LoadedRecordings, LoadedRecordings]:
     """Recordings to fit and held-out ones. Raises ConfigError for arguments that exclude each other."""
     to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
-    _check_share(holdout_share, to_validate)
+    if holdout_share is not None and to_validate:
+        raise ConfigError(
+            "--holdout-share has no effect together with held-out recordings (of a run folder, every third episode is "
+            "held out); remove the option, or name single recordings."
+        )
     latency_s = car.simulator.latency_s()
     fit, validation = load_recordings(to_fit, "fit", latency_s), load_recordings(to_validate, "held out", latency_s)
     check_contents([*fit.uses, *validation.uses])
@@ -263,14 +267,6 @@ def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: Recordi
 
     text = model_toml(diagnosis, simulator, noise)
     return CarFile(f"{name} (diagnosed)", text, with_parameter_std(diagnosis, simulator), None, noise)
-
-
-def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike]) -> None:
-    if holdout_share is not None and held_out:
-        raise ConfigError(
-            "--holdout-share has no effect together with held-out recordings (of a run folder, every third episode is "
-            "held out); remove the option, or name single recordings."
-        )
 
 
 def _checked_effects(effects: Sequence[str]) -> tuple[str, ...]:

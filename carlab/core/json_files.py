@@ -47,14 +47,16 @@ def _integer(text: str) -> int:
 
 
 def plain(value: Any, names: Mapping[str, str] | None = None) -> Any:
-    """Data for a JSON file: tuples become lists, and numbers that are not finite become null.
+    """Data for a JSON file: tuples and arrays become lists, and numbers that are not finite become null.
 
     Args:
-        value: mappings, lists and tuples of texts and numbers.
+        value: mappings, lists, tuples and NumPy arrays of texts and numbers.
         names: names in the file of keys of ``value`` that differ.
     """
     if isinstance(value, Mapping):
         return {(names or {}).get(str(k), str(k)): plain(v, names) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(v, names) for v in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist(), names)
     return None if isinstance(value, float) and not math.isfinite(value) else value

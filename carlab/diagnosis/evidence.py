@@ -20,8 +20,7 @@ from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import EVIDENCE
 from carlab.diagnosis.unexplained.description import start_features, worst_regime
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.errors import simulation_errors
 from sim_backends.effects import EFFECTS
 from sim_backends.registry import REGISTRY
 
@@ -152,7 +151,7 @@ def _where(
         x, y, radius = (parameters[p].value for p in effect.disc_parameters)
         place = (x, y, radius)
     time = (0.0, float(windows.t0_s.max())) if "time" in effect.depends_on else None
-    final = prediction_errors(simulate_windows(windows, without.config), windows)[0, :, -1]
+    final = simulation_errors(windows, without.config)[:, -1]
     size = np.abs(final[:, STATE_NAMES.index(channels[0])])
     return ErrorLocation(channels, worst_regime(start_features(windows), size), lag, time, place)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
 from carlab.diagnosis.curves.support import without_extrapolation
@@ -16,6 +18,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.recordings import SplitRecordings
 from carlab.diagnosis.selection.problem import RunControl
 from carlab.diagnosis.settings import DiagnosisSettings
+from carlab.prediction.errors import final_errors
 from carlab.prediction.network_ensemble import train_ensemble
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
 from carlab.prediction.windows import PredictionWindows
@@ -55,7 +58,8 @@ def errors_with_events(
     """Held-out errors of all models with the windows that events left out; empty without such windows."""
     if not len(event_windows):
         return {}
-    return {name: held_out.summary_with(event_windows, errors[name], model) for name, model in models.items()}
+    together = {name: np.concatenate([errors[name], final_errors(m, event_windows)]) for name, m in models.items()}
+    return {name: held_out.summary(each) for name, each in together.items()}
 
 
 def measured_curves(
@@ -63,12 +67,7 @@ def measured_curves(
 ) -> tuple[CurveFit | None, CurveTrial | None]:
     """Measured curves if they are wanted, and the model leaves a residual that a curve may explain.
 
-    Args:
-        scored: the search with its held-out errors.
-        described: fit with uncatalogued physics, if that describes the residual.
-        recordings: the recordings.
-        request: arguments of the diagnosis.
-        control: callbacks.
+    The model is the fit ``described`` with uncatalogued physics, if that describes the residual, else the effects.
 
     Returns:
         The fit with accepted curves, and what the stage did; None without this stage, and if the user ended it.

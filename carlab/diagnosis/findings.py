@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
-
-import numpy as np
 
 from carlab.core.json_files import plain
 from carlab.core.quantities import FloatArray
@@ -20,7 +18,6 @@ from carlab.diagnosis.measured import CurveTrial as CurveTrial
 from carlab.diagnosis.measured import Estimate as Estimate
 from carlab.diagnosis.measured import FormFinding as FormFinding
 from carlab.diagnosis.measured import RejectedCurves as RejectedCurves
-from carlab.diagnosis.measured import curve_table
 from carlab.diagnosis.settings import EVIDENCE
 
 SCHEMA = "carlab.diagnosis/1"
@@ -291,58 +288,24 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
-        effects = []
-        for e in self.effects:
-            found = asdict(e)
-            found["indistinguishable_from"] = list(e.indistinguishable_from)
-            if e.where.time is not None:
-                found["where"]["time"] = {"kind": "drift", "from_s": e.where.time[0], "to_s": e.where.time[1]}
-            if e.where.place is not None:
-                found["where"]["place"] = dict(zip(("x", "y", "radius"), e.where.place, strict=True))
-            effects.append(found)
-        unexplained = None
-        if self.unexplained is not None and self.unexplained.share >= EVIDENCE.unexplained_share_min:
-            unexplained = asdict(self.unexplained)
-            unexplained["class"] = unexplained.pop("kind")
-        made = {
-            "schema": SCHEMA,
-            "verdict": self.verdict,
-            "sentence": self.sentence,
-            "advice": self.advice,
-            "effects": effects,
-            "parameters": {
-                name: {**asdict(e), "car_file": self.car_file_parameters.get(name)}
-                for name, e in self.parameters.items()
-            },
-            "limits": {effect: {k: asdict(e) for k, e in own.items()} for effect, own in self.limits.items()},
-            "fit": {
-                "horizon_s": self.horizon_s,
-                "fitted_score": self.fitted_score,
-                "held_out_share": self.held_out_share,
-                "held_out": {k: asdict(v) for k, v in self.held_out.items()},
-            },
-            "unexplained": unexplained,
-            "curves": [curve_table(curve) for curve in self.curves],
-            "curve_trial": None if self.curve_trial is None else asdict(self.curve_trial),
-            "ceiling": None if self.ceiling is None else asdict(self.ceiling),
-            "skill": [asdict(s) for s in self.skill],
-            "drift": [_drift_table(d) for d in self.drift],
-            "search": asdict(self.search),
-            "events": {
-                **asdict(self.events),
-                "held_out_with_events": {k: asdict(v) for k, v in self.held_out_with_events.items()},
-            },
-            "data_faults": [asdict(f) for f in self.data_faults],
-            "recordings": [asdict(r) for r in self.recordings],
-            "seed": self.seed,
-            "seconds": self.seconds,
-        }
-        return dict(plain(made))
-
-
-def _drift_table(drift: Drift) -> dict[str, Any]:
-    table = asdict(replace(drift, t_s=np.zeros(0), mean=np.zeros(0), std=np.zeros(0)))
-    return table | {name: getattr(drift, name).tolist() for name in ("t_s", "mean", "std")}
+        made = asdict(self)
+        for effect in made["effects"]:
+            where = effect["where"]
+            if where["time"] is not None:
+                where["time"] = {"kind": "drift", "from_s": where["time"][0], "to_s": where["time"][1]}
+            if where["place"] is not None:
+                where["place"] = dict(zip(("x", "y", "radius"), where["place"], strict=True))
+        if (residual := made["unexplained"]) is not None:
+            residual["class"] = residual.pop("kind")
+            if residual["share"] < EVIDENCE.unexplained_share_min:
+                made["unexplained"] = None
+        stated = made.pop("car_file_parameters")
+        for name, estimate in made["parameters"].items():
+            estimate["car_file"] = stated.get(name)
+        of_fit = ("horizon_s", "fitted_score", "held_out_share", "held_out")
+        made["fit"] = {name: made.pop(name) for name in of_fit}
+        made["events"]["held_out_with_events"] = made.pop("held_out_with_events")
+        return dict(plain({"schema": SCHEMA, **made}))
 
 
 def final_model_name(models: Iterable[str]) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from carlab.core.quantities import FloatArray
 
@@ -116,12 +115,3 @@ class CurveFinding:
     std: FloatArray
     support_s: FloatArray
     form: FormFinding | None = None
-
-
-def curve_table(curve: CurveFinding) -> dict[str, Any]:
-    """Plain data of a measured curve, ready for JSON but for NaN."""
-    arrays = ("car_file", "measured", "std", "support_s")
-    plain: dict[str, Any] = {"id": curve.id, "quantity": curve.quantity, "unit": curve.unit}
-    plain["axes"] = [asdict(a) for a in curve.axes]
-    plain["form"] = None if curve.form is None else asdict(curve.form)
-    return plain | {name: getattr(curve, name).tolist() for name in arrays}

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlab.core.quantities import FloatArray
+from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.curves.curve_rival import RIVAL_CURVES, curve_in_addition, replacing_curve
 from carlab.diagnosis.decisions import Alternatives, Condition
 from carlab.diagnosis.findings import Unexplained
@@ -24,7 +24,7 @@ from carlab.diagnosis.selection.correlated_errors import without_unsupported_eff
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.rival_physics import RivalPhysics, additional_physics, replacing_physics
 from carlab.diagnosis.selection.search import restrict
-from carlab.diagnosis.unexplained.description import ResidualModel, describe, fit_residual_terms, start_features
+from carlab.diagnosis.unexplained.description import ResidualModel, fit_residual_terms, start_features, worst_regime
 from carlab.diagnosis.unexplained.vibration import Vibration
 from carlab.diagnosis.weak_effects import without_harmful_effects, without_negligible_effects
 
@@ -128,9 +128,9 @@ def _rival_without_names(
     return curve if additional is None or curve.gain > additional.gain else additional
 
 
-def residual_of(problem: SearchProblem, found: SearchResult, term_chi2_min: float | None = None) -> ResidualModel:
+def residual_of(problem: SearchProblem, found: SearchResult) -> ResidualModel:
     """Unnamed terms in addition to the accepted effects."""
-    return fit_residual_terms(problem.windows, found.best, found.scale, term_chi2_min)
+    return fit_residual_terms(problem.fitter(found.scale), found.best)
 
 
 def _are_spurious(
@@ -177,7 +177,7 @@ def _limits_in_addition(
 def _limits_in_place(problem: SearchProblem, found: SearchResult) -> Alternatives:
     """Conditions on the gain of unnamed terms in place of the accepted effects."""
     gain = _gain_of_effects(problem, found)
-    terms = fit_residual_terms(problem.windows, found.base, found.scale)
+    terms = fit_residual_terms(problem.fitter(found.scale), found.base)
     ratio = terms.gain / gain if gain > 0.0 else np.inf
     is_similar = Condition("rivals.unnamed_ratio", ratio, problem.settings.rivals.unnamed_ratio, above=False)
     return (is_similar,), (_is_irrelevant(problem, found, terms.gain - gain),)
@@ -261,19 +261,14 @@ def describe_unexplained(
 ) -> tuple[Unexplained, Fit | None]:
     """Describe the unexplained residual for the report.
 
-    Args:
-        problem: the search problem.
-        naming: accepted effects, and physics outside the catalogue.
-        share: unexplained share of the squared excess.
-        error: held-out errors with the accepted effects (S, 6).
-        held_out: windows and noise floor.
+    The residual is the ``share`` of the squared excess, with the held-out errors ``error`` (S, 6).
 
     Returns:
         The description, and the fit with uncatalogued physics, with covariance, if that describes the residual.
     """
-    residual = naming.residual
+    residual, fitter = naming.residual, problem.fitter(naming.found.scale)
     if not naming.has_unnamed:
-        residual = residual_of(problem, naming.found, problem.settings.rivals.weak_term_chi2)
+        residual = fit_residual_terms(fitter, naming.found.best, problem.settings.rivals.weak_term_chi2)
     of_terms = Description(residual.class_statement(), residual.formula(), residual.fall / held_out.floor**2)
     description = _describe_by_rival(problem, naming, residual, error, held_out) or of_terms
     squared = (error / held_out.floor) ** 2
@@ -283,11 +278,11 @@ def describe_unexplained(
             description, naming.vibration, excess, held_out, problem.settings.rivals.vibration_share
         )
     fall = description.fall if description.fall.max() > 0.0 else excess
-    window_errors: FloatArray = np.sqrt(squared.mean(axis=1))
-    features = start_features(held_out.windows)
-    entry = describe(share, description.class_statement, description.formula, fall, window_errors, features)
-    fit = None if description.fit is None else problem.fitter(naming.found.scale).with_covariance(description.fit)
-    return entry, fit
+    order = np.argsort(-fall)
+    channels = tuple(STATE_NAMES[k] for k in order if fall[k] > 0.5 * fall[order[0]])
+    regime = worst_regime(start_features(held_out.windows), np.sqrt(squared.mean(axis=1)))
+    fit = None if description.fit is None else fitter.with_covariance(description.fit)
+    return Unexplained(share, channels, regime, description.class_statement, description.formula), fit
 
 
 def _describe_by_rival(

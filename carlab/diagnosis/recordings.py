@@ -96,15 +96,12 @@ def split_recordings(
     held_out_windows, event_windows = _cut(
         held_out_segments, "held-out part", cut.held_out_window_s, cut.held_out_stride_s, cut.max_held_out_windows
     )
-    events = (*_with_roles(fit_events, () if has_own else held_out_segments), *_held_out(held_out_events))
+    events_to_fit = _with_roles(fit_events, () if has_own else held_out_segments)
+    events = (*events_to_fit, *(replace(event, role="held out") for event in held_out_events))
     use = EventUse(events, not keep_events, len(fit_event_windows), len(event_windows))
     return SplitRecordings(
         tuple(fit_segments), tuple(held_out_segments), fit_windows, held_out_windows, event_windows, use
     )
-
-
-def _held_out(events: Sequence[Event]) -> tuple[Event, ...]:
-    return tuple(replace(event, role="held out") for event in events)
 
 
 def _with_roles(events: Sequence[Event], held_out_segments: Sequence[RecordingSegment]) -> tuple[Event, ...]:

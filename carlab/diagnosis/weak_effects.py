@@ -11,15 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit_without_each
 from carlab.diagnosis.selection.search import with_model
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.errors import simulation_errors
 
 log = logging.getLogger(__name__)
 
@@ -64,12 +62,8 @@ def practical_size(problem: SearchProblem, model: Model, without: Fit) -> float:
         The largest ratio over channels of two numbers at the end of the windows: the root mean square difference of
         both predictions, and the error scale of ``model``, which is at least the noise floor.
     """
-    windows = problem.windows
-
-    def final_error(fit: Fit) -> FloatArray:
-        return np.asarray(prediction_errors(simulate_windows(windows, fit.config), windows)[0, :, -1])
-
-    difference = np.sqrt(np.mean((final_error(without) - final_error(model.fit)) ** 2, axis=0))
+    before, after = (simulation_errors(problem.windows, fit.config)[:, -1] for fit in (without, model.fit))
+    difference = np.sqrt(np.mean((before - after) ** 2, axis=0))
     return float((difference / model.scale.sigma[-1]).max())
 
 

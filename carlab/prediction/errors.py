@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from carlab.core.planar import to_body
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
-from carlab.prediction.predict import PredictiveModel
+from carlab.prediction.predict import PredictiveModel, simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
 
 MAX_ERROR = 1e3
 """Bound of a final error in SI units; it also replaces non-finite errors of a diverged simulator."""
@@ -45,6 +47,13 @@ def prediction_errors(predicted: FloatArray, windows: PredictionWindows, ticks: 
     yaw = windows.initial_states[:, 2, None]
     error[..., 0], error[..., 1] = to_body(error[..., 0], error[..., 1], yaw)
     return error
+
+
+def simulation_errors(
+    windows: PredictionWindows, config: SimulatorConfig, values: Mapping[str, FloatArray] | None = None
+) -> FloatArray:
+    """Errors (S, K + 1, 6) of a simulator as ``prediction_errors``, with other ``values`` (1,) by dotted name."""
+    return prediction_errors(simulate_windows(windows, config, values)[0], windows)
 
 
 def final_errors(model: PredictiveModel, windows: PredictionWindows) -> FloatArray:

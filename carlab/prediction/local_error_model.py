@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from carlab.core.errors import DataError
-from carlab.core.planar import to_world
 from carlab.core.quantities import FloatArray
 from carlab.prediction.adaptation_settings import ADAPTATION
-from carlab.prediction.errors import bounded, prediction_errors
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.errors import bounded, simulation_errors
+from carlab.prediction.initial_states import with_turned_positions
 from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -70,19 +69,19 @@ class LocalErrorModel:
                 known[:, : len(past)] = self._is_known(windows, past, rows)
             weights = _weights(states[rows], past_states, known)
             expected[rows] = np.tensordot(weights, errors, axes=1)
-        return predicted - _in_world(expected, windows)
+        return predicted - with_turned_positions(expected, windows.initial_states[:, 2, None])
 
     def _windows(self, segments: Sequence[RecordingSegment], horizon_s: float) -> PredictionWindows | None:
         """Windows of the segments; None if the car moves in none."""
         try:
-            windows = cut_windows(segments, horizon_s, ADAPTATION.weight_stride_s) if segments else None
+            windows = cut_windows(segments, horizon_s, ADAPTATION.weight_stride_s)
         except DataError:
             return None
-        return None if windows is None else replace(windows, velocity_window_s2=self.velocity_window_s2)
+        return replace(windows, velocity_window_s2=self.velocity_window_s2)
 
     def _errors(self, windows: PredictionWindows) -> FloatArray:
         """Errors (S, K + 1, 6) of the simulator, finite and bounded."""
-        return bounded(prediction_errors(simulate_windows(windows, self.config)[0], windows), ADAPTATION.max_error)
+        return bounded(simulation_errors(windows, self.config), ADAPTATION.max_error)
 
     def _is_known(self, windows: PredictionWindows, past: PredictionWindows, rows: slice) -> NDArray[np.bool_]:
         """Which windows of the past (s, N) end before windows of a batch start."""
@@ -115,11 +114,3 @@ def _weights(states: FloatArray, past_states: FloatArray, known: NDArray[np.bool
     covariance = np.where(used[:, :, None] & used[:, None], covariance, (1.0 + ADAPTATION.local_noise) * np.eye(count))
     np.put_along_axis(weights, nearest, np.linalg.solve(covariance, kernel[..., None])[..., 0], axis=1)
     return weights
-
-
-def _in_world(errors: FloatArray, windows: PredictionWindows) -> FloatArray:
-    """Errors (S, K + 1, 6) in the body frame of each window's initial state with x and y in the recording's frame."""
-    yaw = windows.initial_states[:, 2, None]
-    turned = errors.copy()
-    turned[..., 0], turned[..., 1] = to_world(errors[..., 0], errors[..., 1], yaw)
-    return turned

@@ -12,7 +12,8 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.limits import effect_limits
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.sentences import number, verdict_sentence
+from carlab.diagnosis.report.numbers import number
+from carlab.diagnosis.report.sentences import verdict_sentence
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import EVIDENCE

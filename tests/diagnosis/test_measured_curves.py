@@ -18,7 +18,7 @@ from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
 from carlab.diagnosis.report.html_page import render_page
-from carlab.diagnosis.report.sentences import with_unit
+from carlab.diagnosis.report.numbers import with_unit
 from carlab.diagnosis.report.write import write_report
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -273,7 +273,8 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
 
 
 def test_verdict_states_the_error_with_measured_curves(outcome):
-    from carlab.diagnosis.report.sentences import number, verdict_sentence
+    from carlab.diagnosis.report.numbers import number
+    from carlab.diagnosis.report.sentences import verdict_sentence
 
     found = outcome.diagnosis.held_out["with_curves"]
     assert (

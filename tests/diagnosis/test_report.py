@@ -24,7 +24,7 @@ from carlab.diagnosis.findings import (
     Unexplained,
 )
 from carlab.diagnosis.report.figures import restarts
-from carlab.diagnosis.report.sentences import number
+from carlab.diagnosis.report.numbers import number
 from carlab.diagnosis.report.svg import nice_ticks
 from carlab.diagnosis.report.write import write_report
 

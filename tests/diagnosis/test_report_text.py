@@ -22,16 +22,14 @@ from carlab.diagnosis.findings import (
 )
 from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
+from carlab.diagnosis.report.numbers import number, percent, unit_text
 from carlab.diagnosis.report.residual import explained_share, formula_symbols
 from carlab.diagnosis.report.sentences import (
     confidence_text,
     effect_sentence,
-    number,
-    percent,
     refutation_sentence,
     separating_drive,
     separating_reason,
-    unit_text,
     verdict_sentence,
     verdict_title,
 )

@@ -13,6 +13,7 @@ from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,
+    coordinates_in,
     effect_parameters,
     with_effect,
 )
@@ -65,15 +66,13 @@ def change_candidates(config: SimulatorConfig, only: Sequence[str] | None = None
 
 def with_candidate(config: SimulatorConfig, candidate: ChangeCandidate) -> SimulatorConfig:
     """The simulator with an effect added at its identity value if it is not present."""
-    is_new = candidate.id in CATALOGUE and candidate.id not in config.effects
-    return with_effect(config, candidate.id) if is_new else config
+    return with_effect(config, candidate.id) if candidate.id in CATALOGUE else config
 
 
 def candidate_points(fitter: Fitter, config: SimulatorConfig, candidate: ChangeCandidate) -> CandidatePoints:
     """Points of a candidate: of an absent effect as in a screening, of a known parameter one step to both sides."""
     whole = with_candidate(config, candidate)
-    values = whole.values()
-    z0 = np.array([f.coordinate(values[f.name]) for f in candidate.free])
+    z0 = coordinates_in(whole, candidate.free)
     if whole is config:
         steps = np.vstack([np.eye(len(z0)), -np.eye(len(z0))])
         return CandidatePoints(candidate, whole, z0, z0 + steps)

@@ -151,10 +151,7 @@ def _select(
         found.append(best)
     else:
         is_complete = len(found) == COMPARISON.max_changes
-    changes = [
-        _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value))
-        for one, near in zip(found, ties, strict=True)
-    ]
+    changes = [_change(one, found[-1].fit, near, adjusted(one.p_value)) for one, near in zip(found, ties, strict=True)]
     return tuple(changes), tested, is_complete
 
 
@@ -194,21 +191,12 @@ def _ties(best: _Refined, refined: Sequence[_Refined], compared: ComparedGroups)
     return tuple(name for _, name in sorted(near)[:2])
 
 
-def _joint(one: _Refined, last: ChangeFit) -> tuple[FloatArray, list[int], ChangeFit]:
-    """Coordinates of a change in the last fit, their indices, and the fit."""
-    names = [f.name for f in last.free]
-    index = [names.index(f.name) for f in one.linear.secants.at.candidate.free]
-    return last.z[index], index, last
-
-
-def _change(
-    one: _Refined,
-    joint: tuple[FloatArray, list[int], ChangeFit],
-    ties: tuple[str, ...],
-    p: float,
-) -> Change:
-    z, index, last = joint
+def _change(one: _Refined, last: ChangeFit, ties: tuple[str, ...], p: float) -> Change:
+    """A change with its numbers in the ``last`` fit, which contains all changes."""
     at, found = one.linear.secants.at, one.linear.difference
+    names = [f.name for f in last.free]
+    index = [names.index(f.name) for f in at.candidate.free]
+    z = last.z[index]
     variance = np.diag(last.naive_covariance)[index] * found.design_effect * found.variance_ratio
     std = np.sqrt(variance + (COMPARISON.model_error_share * (z - at.z0)) ** 2)
     quantile = float(stats.t.ppf(0.95, max(min(found.dof - (len(index) - 1), found.spread.dof), 1.0)))
@@ -221,7 +209,4 @@ def _change(
         parameters[name] = Estimate(float(value[k]), spread, limits[0], limits[1], REGISTRY[f.name].unit)
         reference[name] = float(f.value(np.asarray(at.z0[k])))
     standard_errors = float(np.sqrt(max(one.likelihood_ratio, 0.0) / found.design_effect))
-    return Change(
-        at.candidate.id, parameters, reference, p, one.fit.loss_share,
-        standard_errors, ties,
-    )  # fmt: skip
+    return Change(at.candidate.id, parameters, reference, p, one.fit.loss_share, standard_errors, ties)

@@ -110,9 +110,7 @@ def difference(
     variances = [effect / information for effect, information in zip(effects, (first, second), strict=True)]
     by_block = sum(variances) / (1.0 / first + 1.0 / second)
     dof = sum(variances) ** 2 / sum(v**2 / (number - 1.0) for v, number in zip(variances, numbers, strict=True))
-    spread = spread_of_parts(
-        informations, residuals, [group.part for group in groups], effects, COMPARISON.min_part_share
-    )
+    spread = spread_of_parts(informations, residuals, [group.part for group in groups], effects)
     return None if spread is None else Difference(change, steps[0], ratio, (first, second), by_block, spread, dof)
 
 

@@ -78,7 +78,6 @@ def spread_of_parts(
     scores: Sequence[FloatArray],
     parts: Sequence[IndexArray],
     block_effects: Sequence[float],
-    min_part_share: float,
 ) -> DriveSpread | None:
     """Spread of the scores of parts over that expected of independent blocks; None without two parts in any group.
 
@@ -87,13 +86,12 @@ def spread_of_parts(
         scores: derivatives of the loss of each window (S,) at the step of its group.
         parts: index of the part of each window (S,).
         block_effects: variance for independent blocks over that for independent errors, of each group.
-        min_part_share: minimum share of the information of a group that a part must have.
     """
     ratios, dof = [], 0
     for information, score, part, effect in zip(informations, scores, parts, block_effects, strict=True):
         of_part = np.bincount(part, weights=information)
         share = of_part / of_part.sum()
-        usable = share > min_part_share
+        usable = share > COMPARISON.min_part_share
         if usable.sum() > 1:
             expected = effect * of_part * (1.0 - share)
             ratios += list((np.bincount(part, weights=score) ** 2 / np.maximum(expected, 1e-12))[usable])

@@ -14,7 +14,7 @@ from carlab.diagnosis.comparison.drive_spread import part_blocks, parts_of
 from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.identification.fit import Fitter
-from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, stated_effects
+from carlab.diagnosis.identification.fit_parameters import coordinates_in, stated_parameters
 from carlab.diagnosis.identification.held_out_errors import mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -86,9 +86,8 @@ def compared_groups(
     noise = estimate_noise(segments[0], first.curvature_bias)
     floor = mean_noise_floor(first, noise, nominal)
     problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), ())
-    base = base_parameters(nominal)
-    free = (*base, *(f for name in stated_effects(nominal) for f in effect_parameters(name, nominal)))
-    fitted = fit_with_scale(problem, (), problem.nominal_coordinates(free), free)
+    free = stated_parameters(nominal)
+    fitted = fit_with_scale(problem, (), coordinates_in(nominal, free), free)
     one, two = (
         Fitter(w.thinned(limit), fitted.scale) for w, limit in zip((first, second), COMPARISON.max_windows, strict=True)
     )

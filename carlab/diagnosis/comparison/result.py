@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from carlab.diagnosis.findings import DataFault, Estimate
-from carlab.diagnosis.report.sentences import effect_noun, listed, number, percent, unit_text
+from carlab.diagnosis.report.numbers import listed, number, percent, unit_text
+from carlab.diagnosis.report.sentences import effect_noun
 from sim_backends.effects import EFFECTS
 
 SCHEMA = "carlab.compare/1"
@@ -105,14 +107,7 @@ def verdict_sentence(verdict: ComparisonVerdict, changes: Sequence[Change], *, i
         return "The comparison was stopped before it found a change. Compare again for a result."
     if not changes:
         return "No effect or parameter of the simulator changed significantly between the two groups."
-    falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
+    falls = percent(1.0 - math.prod(1.0 - c.loss_share for c in changes))
     names = listed([c.name for c in changes])
     text = f"Between the two groups changed: {names}. This lowers the loss of the second group by {falls}."
     return text if is_complete else f"{text} The comparison was stopped, so it may have missed further changes."
-
-
-def _product(factors: Sequence[float]) -> float:
-    made = 1.0
-    for factor in factors:
-        made *= factor
-    return made

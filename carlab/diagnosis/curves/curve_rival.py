@@ -27,16 +27,10 @@ so their fits take seconds."""
 
 
 def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
-    """A measured curve of a command, if it explains significantly more than the accepted effects that it contains.
+    """The first measured curve that explains significantly more than the accepted effects that it contains.
 
-    Args:
-        problem: the search problem.
-        found: the accepted effects.
-        control: records the decision about each effect that a curve contains.
-
-    Returns:
-        The first such curve with the other effects. None if no curve explains more, if no accepted effect is contained
-        in a curve, and after a search that was cut short: the curve may then imitate an effect that was not tried.
+    It is fitted with the other effects. None if no curve explains more, if no accepted effect is contained in a curve,
+    and after a search that was cut short: the curve may then imitate an effect that was not tried.
     """
     if not found.is_complete:
         return None

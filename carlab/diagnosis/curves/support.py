@@ -13,12 +13,14 @@ from carlab.diagnosis.curves.curve_fit import CurveFit
 from carlab.diagnosis.curves.form_fit import identify_form
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.identification.fit_parameters import numbers_at
+from carlab.diagnosis.identification.knots_in_use import knot_weights
 from carlab.diagnosis.settings import CurveSettings
 from carlab.prediction.windows import RecordingSegment
 from sim_backends.array_ops import ARRAYS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS, Forces, MeasuredCurve
-from sim_backends.effects.curves import weights
+from sim_backends.effects import CURVES, Forces, MeasuredCurve
+
+MEASURED_CURVES = {curve.id: curve for curve in CURVES}
 
 
 def curve_findings(
@@ -26,9 +28,7 @@ def curve_findings(
 ) -> tuple[CurveFinding, ...]:
     """Each measured curve and that of the car file; knots without data have no value."""
     made = []
-    for curve_id in found.curves:
-        curve = EFFECTS[curve_id]
-        assert isinstance(curve, MeasuredCurve)
+    for curve in (MEASURED_CURVES[name] for name in found.curves):
         support_s = driving_time_s(curve, found.fit.config, segments)
         grid = np.meshgrid(*(np.array(axis.knots) for axis in curve.axes), indexing="ij")
         measured = _curve(found, curve, found.fit.z, grid)
@@ -52,9 +52,7 @@ def curve_findings(
 def without_extrapolation(found: CurveFit, segments: tuple[RecordingSegment, ...], settings: CurveSettings) -> CurveFit:
     """Give knots without any data the deviation of the nearest knot with data; the penalty alone would extrapolate."""
     changes: dict[str, float] = {}
-    for curve_id in found.curves:
-        curve = EFFECTS[curve_id]
-        assert isinstance(curve, MeasuredCurve)
+    for curve in (MEASURED_CURVES[name] for name in found.curves):
         driven = driving_time_s(curve, found.fit.config, segments) >= settings.min_fitted_s
         values = found.fit.config.values()
         table = np.array(curve.table({p.name: values[f"effects.{curve.id}.{p.name}"] for p in curve.parameters}))
@@ -75,12 +73,7 @@ def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, segments: tupl
     total = np.zeros([len(axis.knots) for axis in curve.axes])
     for segment in segments:
         coordinates = curve.coordinates(ARRAYS, recorded_forces(segment, config))
-        by_axis = [
-            np.stack(np.broadcast_arrays(*weights(ARRAYS, np.asarray(x), axis.knots)))
-            for x, axis in zip(coordinates, curve.axes, strict=True)
-        ]
-        product = by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] * by_axis[1][None]
-        total += segment.period_s * product.sum(axis=-1)
+        total += segment.period_s * knot_weights(curve, coordinates, len(segment.t_s)).sum(axis=-1)
     return total
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
@@ -30,11 +31,15 @@ class Scale:
     @classmethod
     def of(cls, error: FloatArray, floor: FloatArray) -> Scale:
         """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
-        last = error.shape[1] - 1
-        count = IDENTIFICATION.loss_steps
-        steps = np.unique(np.linspace(last / count, last, count).round().astype(int))
+        steps = _loss_steps(error.shape[1] - 1)
         spread = STD_OVER_MAD * np.median(np.abs(error[:, steps]), axis=0)
         return cls(steps, np.maximum(spread, floor))
+
+    @classmethod
+    def of_floor(cls, floor: FloatArray) -> Scale:
+        """The noise floor (K + 1, 6) along a window."""
+        steps = _loss_steps(len(floor) - 1)
+        return cls(steps, floor[steps])
 
     def white(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
@@ -50,6 +55,12 @@ class Scale:
     def as_bytes(self) -> tuple[bytes, ...]:
         """The content, to compare scales by."""
         return tuple(b"" if each is None else each.tobytes() for each in (self.steps, self.sigma, self.root))
+
+
+def _loss_steps(last: int) -> NDArray[np.int64]:
+    """Steps (U,) of a window of ``last`` steps whose errors enter the loss, at even spacing."""
+    count = IDENTIFICATION.loss_steps
+    return np.unique(np.linspace(last / count, last, count).round().astype(int))
 
 
 def huber(white: FloatArray) -> FloatArray:

@@ -65,11 +65,6 @@ class FitParameter:
     choice: bool = False
     is_delay: bool = False
 
-    @property
-    def difference_step(self) -> float:
-        """Step of z for finite differences."""
-        return DELAY_DIFFERENCE_STEP if self.is_delay else DIFFERENCE_STEP
-
     def value(self, z: FloatArray) -> FloatArray:
         """Values at coordinates z, both (...)."""
         if self.choice:
@@ -86,11 +81,7 @@ class FitParameter:
         return (value - self.origin) / self.size
 
 
-def base_parameters(
-    config: SimulatorConfig,
-    *,
-    uses_std: bool = False,
-) -> tuple[FitParameter, ...]:
+def base_parameters(config: SimulatorConfig, *, uses_std: bool = False) -> tuple[FitParameter, ...]:
     """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency.
 
     Args:
@@ -164,6 +155,11 @@ def tyre_effects(config: SimulatorConfig) -> tuple[str, ...]:
     )
 
 
+def stated_parameters(config: SimulatorConfig) -> tuple[FitParameter, ...]:
+    """Base parameters, and those of the effects of the catalogue that the car file states."""
+    return (*base_parameters(config), *(f for name in stated_effects(config) for f in effect_parameters(name, config)))
+
+
 def stated_effects(config: SimulatorConfig) -> tuple[str, ...]:
     """Effects of the catalogue that the car file states, without measured curves and uncatalogued physics."""
     return tuple(name for name in config.effects if name in CATALOGUE)
@@ -179,7 +175,13 @@ def stated_values(config: SimulatorConfig, effect_id: str) -> dict[str, float]:
 
 def difference_steps(free: Sequence[FitParameter]) -> FloatArray:
     """Steps (n,) of the coordinates for finite differences."""
-    return np.array([f.difference_step for f in free])
+    return np.array([DELAY_DIFFERENCE_STEP if f.is_delay else DIFFERENCE_STEP for f in free])
+
+
+def coordinates_in(config: SimulatorConfig, free: Sequence[FitParameter]) -> FloatArray:
+    """Coordinates (n,) of n parameters at the values of a simulator; 0 for a parameter that it lacks."""
+    values = config.values()
+    return np.array([f.coordinate(values[f.name]) if f.name in values else 0.0 for f in free])
 
 
 def numbers_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, float]:

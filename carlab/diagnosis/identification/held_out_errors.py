@@ -37,12 +37,7 @@ class HeldOut:
     noise: Noise
 
     @classmethod
-    def of(
-        cls,
-        windows: PredictionWindows,
-        noise: Noise,
-        config: SimulatorConfig,
-    ) -> HeldOut:
+    def of(cls, windows: PredictionWindows, noise: Noise, config: SimulatorConfig) -> HeldOut:
         """Compute the noise floor; the car file's simulator ``config`` propagates the errors of initial states."""
         return cls(windows, noise_floor(windows, noise, config)[-1], noise)
 
@@ -73,13 +68,9 @@ class HeldOut:
             score=self.score(error),
         )
 
-    def summary_with(self, others: PredictionWindows, error: FloatArray, model: PredictiveModel) -> FitErrors:
-        """The report's figures of a model with errors (S, 6), for its windows and others together."""
-        return self.summary(np.concatenate([error, final_errors(model, others)]))
-
     def floor_summary(self) -> FitErrors:
         """The floor itself; its score is 1."""
-        return self.summary(np.tile(self.floor, (2, 1)))
+        return self.summary(self.floor[None])
 
     def gain(self, without: FloatArray, with_it: FloatArray) -> tuple[float, float]:
         """Held-out gain in Huber log-likelihood from errors (S, 6) to errors (S, 6), and its clustered error."""
@@ -94,11 +85,7 @@ class HeldOut:
         return {name: float(b / max(a, 1e-12) - 1.0) for name, a, b in zip(STATE_NAMES, after, before, strict=True)}
 
 
-def noise_floor(
-    windows: PredictionWindows,
-    noise: Noise,
-    config: SimulatorConfig,
-) -> FloatArray:
+def noise_floor(windows: PredictionWindows, noise: Noise, config: SimulatorConfig) -> FloatArray:
     """Error (K + 1, 6) that noise alone causes along a window: measurement noise and propagated initial error."""
     reference = simulate_windows(windows, config)
     variance = np.tile(noise.measured**2, (windows.steps + 1, 1))

@@ -69,14 +69,22 @@ def knots_in_use(
     def mark(curve: MeasuredCurve, coordinates: Sequence[Value]) -> None:
         if curve.id not in used:  # a curve of the car file, which is not fitted
             return
-        by_axis = [
-            np.stack([w > 0.0 for w in weights(ARRAYS, np.broadcast_to(np.asarray(x), count), axis.knots)])
-            for x, axis in zip(coordinates, curve.axes, strict=True)
-        ]
-        used[curve.id] |= by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] & by_axis[1][None]
+        used[curve.id] |= knot_weights(curve, coordinates, count) > 0.0
 
     step_s = longest_step_s(windows, config, values)
     ignored = np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a diverged simulation
     with ignored, report_evaluations(mark):
         simulate_windows(windows, config, values, max_step_s=step_s, engine="operators")
     return used
+
+
+def knot_weights(curve: MeasuredCurve, coordinates: Sequence[Value], count: int) -> FloatArray:
+    """Interpolation weights (A, n) or (A, B, n) of the knots of one or two axes at ``count`` = n points.
+
+    ``coordinates`` are those of the points on each axis, each (n,) or a number.
+    """
+    by_axis = [
+        np.stack(np.broadcast_arrays(*weights(ARRAYS, np.broadcast_to(np.asarray(x), count), axis.knots)))
+        for x, axis in zip(coordinates, curve.axes, strict=True)
+    ]
+    return by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] * by_axis[1][None]

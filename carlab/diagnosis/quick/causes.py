@@ -8,7 +8,6 @@ refit. The causes are ranked by two-fold cross-validation over alternate blocks.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,8 +18,10 @@ from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
     base_parameters,
+    coordinates_in,
     effect_parameters,
     stated_effects,
+    stated_parameters,
     with_effect,
 )
 from carlab.diagnosis.identification.gains import clustered_gain
@@ -98,7 +99,7 @@ def find_causes(windows: PredictionWindows, floor: FloatArray, simulator: Simula
         floor: noise floor along a window (K + 1, 6).
         simulator: the simulator without the causes.
     """
-    fitter = Fitter(windows, scale_of(windows, floor))
+    fitter = Fitter(windows, Scale.of_floor(floor))
     reference = fitter.loss(simulator, max_error=QUICK.max_left_out_error)
     perfect = 0.5 * len(fitter.scale.steps) * 6 * len(windows)
     excess = max(float(reference.sum()) - perfect, 1e-9)
@@ -129,13 +130,6 @@ def find_causes(windows: PredictionWindows, floor: FloatArray, simulator: Simula
         values = _reported_values(t, simulator)
         causes.append(Cause(t.candidate.id, share, own_share, t.candidate.with_refit, ties, values))
     return tuple(causes)
-
-
-def scale_of(windows: PredictionWindows, floor: FloatArray) -> Scale:
-    """Steps whose errors enter a fit, with their noise floor; ``floor`` (K + 1, 6) is that along a window."""
-    steps = np.unique(np.linspace(windows.steps / QUICK.used_steps, windows.steps, QUICK.used_steps).round())
-    steps = steps.astype(int)
-    return Scale(steps, floor[steps])
 
 
 def _own_share(before: FloatArray, after: FloatArray, perfect: float, windows: PredictionWindows) -> float:
@@ -169,7 +163,7 @@ def _screen_parameters(
     screen: Screen, simulator: SimulatorConfig, free: tuple[FitParameter, ...]
 ) -> tuple[float, FloatArray]:
     """Screening score of parameters of the simulator, and the initial point (n,) of their fit."""
-    at = _coordinates(simulator, free)
+    at = coordinates_in(simulator, free)
     sizes = SCREENED_COORDINATES[not free[0].logarithmic]
     axes = np.eye(len(free)) if free[0].name not in GRIP_PARAMETERS else np.ones((1, len(free)))
     points = np.array([at + z * axis for axis in axes for z in sizes])
@@ -181,9 +175,8 @@ def _screen_parameters(
 
 def _fit_with_refit(fitter: Fitter, simulator: SimulatorConfig) -> tuple[_Candidate, list[_Candidate]]:
     """Refit all parameters, and add the effects with the best screening scores to the refit."""
-    own = [f for name in stated_effects(simulator) for f in effect_parameters(name, simulator)]
-    free = (*base_parameters(simulator), *own)
-    refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=QUICK.fit_iterations)
+    free = stated_parameters(simulator)
+    refit = fitter.fit(simulator, free, coordinates_in(simulator, free), iterations=QUICK.fit_iterations)
     screen = Screen(fitter, simulator, refit, QUICK.screened_windows)
     screened = [screen.score(name) for name in _new_effects(simulator)]
     screened.sort(key=lambda result: -result.score)
@@ -231,11 +224,6 @@ def _simulator_parameters(simulator: SimulatorConfig) -> list[tuple[str, tuple[F
     both = [(GRIP, grip)] if len(grip) == len(GRIP_PARAMETERS) else []
     effects = [(f"effects.{name}", effect_parameters(name, simulator)) for name in stated_effects(simulator)]
     return [*single, *both, *effects]
-
-
-def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> FloatArray:
-    values = simulator.values()
-    return np.array([f.coordinate(values[f.name]) for f in free])
 
 
 def _reported_values(tested: _Tested, simulator: SimulatorConfig) -> dict[str, FittedParameterValue]:

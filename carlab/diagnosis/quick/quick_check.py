@@ -17,17 +17,17 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.json_files import plain
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
+from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
-from carlab.diagnosis.quick.causes import Cause, find_causes, scale_of
+from carlab.diagnosis.quick.causes import Cause, find_causes
 from carlab.diagnosis.quick.conditions import ErrorCondition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
 from carlab.diagnosis.settings import QUICK
 from carlab.diagnosis.state_alignment import align_states, lost_frames, window_variance_s2, with_known_latency
-from carlab.prediction.errors import bounded, prediction_errors
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.errors import bounded, simulation_errors
 from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -138,7 +138,7 @@ def held_out_loss(episode: EpisodeData, simulators: Sequence[SimulatorConfig]) -
         windows, floor = _windows(repaired, first, window_variance_s2([episode]))
     except DataError:
         return None
-    fitter = Fitter(windows, scale_of(windows, floor))
+    fitter = Fitter(windows, Scale.of_floor(floor))
     return [float(fitter.loss(each, max_error=QUICK.max_left_out_error).sum()) for each in simulators]
 
 
@@ -149,8 +149,7 @@ def _checked(
     simulator: SimulatorConfig,
 ) -> QuickCheck:
     """Check windows with their noise floor (K + 1, 6)."""
-    last = prediction_errors(simulate_windows(windows, simulator), windows)[0, :, -1]
-    final = bounded(last / floor[-1], QUICK.max_error)
+    final = bounded(simulation_errors(windows, simulator)[:, -1] / floor[-1], QUICK.max_error)
     score, score_std = _score(final, windows)
     channels = _channels(final, floor[-1])
     scored = replace(undecided, score=score, score_std=score_std, channels=channels, windows=len(windows))
@@ -173,8 +172,6 @@ def _windows(
 ) -> tuple[PredictionWindows, FloatArray]:
     """Windows of all recordings, and the noise floor along them (K + 1, 6). Raises DataError without windows."""
     segments = segments_of([e for e in episodes if e.ticks >= 2])
-    if not segments:
-        raise DataError("No recording has an unbroken stretch of half a second.")
     few = len({t.recording for t in segments}) < QUICK.few_episodes
     block_s = QUICK.short_block_s if few else QUICK.block_s
     windows = cut_windows(segments, QUICK.window_s, QUICK.stride_s, block_s).thinned(QUICK.max_windows)

@@ -6,7 +6,8 @@ import math
 
 from carlab.diagnosis.quick.causes import ALL_PARAMETERS, GRIP, Cause
 from carlab.diagnosis.quick.quick_check import QuickCheck
-from carlab.diagnosis.report.sentences import CHANNEL_NAMES, number, percent, with_unit
+from carlab.diagnosis.report.numbers import number, percent, with_unit
+from carlab.diagnosis.report.sentences import CHANNEL_NAMES
 
 
 def sentences(check: QuickCheck, decide: str = "carlab diagnose decides") -> tuple[str, ...]:

@@ -29,12 +29,9 @@ def check_integration(fit: Sequence[EpisodeData], nominal: SimulatorConfig) -> l
     """
     try:
         segments = segments_of(fit)
-        if not segments:
-            return []
-        windows = cut_windows(segments, HORIZON_S, 0.5)
+        windows = cut_windows(segments, HORIZON_S, 0.5).thinned(MAX_WINDOWS)
     except DataError:
         return []
-    windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, MAX_WINDOWS).round().astype(np.int64)))
     noise = estimate_noise(segments, windows.curvature_bias).measured
     with np.errstate(all="ignore"):  # a step that is far too coarse overflows
         usual, fine = (simulate_windows(windows, nominal, max_step_s=s, in_double=True) for s in (None, FINE_STEP_S))

@@ -7,13 +7,13 @@ import itertools
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.curves.support import MEASURED_CURVES
 from carlab.diagnosis.findings import CurveFinding, Diagnosis, RejectedCurves
 from carlab.diagnosis.report.figures import Figure
+from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.residual import relevant_residual, remaining_share
-from carlab.diagnosis.report.sentences import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.svg import Chart, padded
 from carlab.diagnosis.settings import DEFAULT, REPORT
-from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.effects.curves import DriveMap
 
 MAX_PANELS = 9
@@ -49,7 +49,7 @@ def _trial_sentences(diagnosis: Diagnosis) -> list[str]:
 
 def _rejection(rejected: RejectedCurves) -> str:
     """The curves that were fitted and not accepted, with the test that they did not pass."""
-    quantities = listed([_quantity(each) for each in rejected.curves])
+    quantities = listed([MEASURED_CURVES[name].quantity for name in rejected.curves])
     z = rejected.standard_errors
     test = "the loss on left-out blocks by"
     size = f"{number(abs(z))} standard errors"
@@ -60,13 +60,6 @@ def _rejection(rejected: RejectedCurves) -> str:
         return f"The measured curve of the {quantities} is fitted but not accepted: it {verb} {test} {size}."
     verb = "raise" if z < 0.0 else "lower"
     return f"The measured curves of the {quantities} are fitted but not accepted: together they {verb} {test} {size}."
-
-
-def _quantity(curve_id: str) -> str:
-    """Quantity of a measured curve: ``wheel angle``."""
-    curve = EFFECTS[curve_id]
-    assert isinstance(curve, MeasuredCurve)
-    return curve.quantity
 
 
 def curves_advice(diagnosis: Diagnosis) -> str:

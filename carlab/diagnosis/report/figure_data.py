@@ -15,7 +15,7 @@ from carlab.diagnosis.findings import FigureData, Trace
 from carlab.diagnosis.recordings import SplitRecordings
 from carlab.diagnosis.settings import REPORT
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
-from carlab.prediction.errors import prediction_errors
+from carlab.prediction.errors import prediction_errors, simulation_errors
 from carlab.prediction.predict import predicted_at, simulate_windows
 from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, RecordingSegment, cut_windows, history_rows
 from sim_backends.car_parameters import SimulatorConfig
@@ -66,7 +66,7 @@ def _correlation(
     windows: PredictionWindows, config: SimulatorConfig, on_throttle: bool
 ) -> tuple[FloatArray, FloatArray, float]:
     """Correlation of the missing acceleration with the rate of a command at lags [s], and its 99 % bound."""
-    error = prediction_errors(simulate_windows(windows, config), windows)[0]
+    error = simulation_errors(windows, config)
     step = min(max(round(REPORT.correlation_step_s / windows.period_s), 1), windows.steps)
     column = 3 if on_throttle else 5
     missing = -error[:, step, column] / (step * windows.period_s)

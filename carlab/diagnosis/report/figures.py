@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from carlab.core.angles import wrap
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.diagnosis.findings import Drift, EffectFinding, FigureData, Trace
-from carlab.diagnosis.report.sentences import CHANNEL_NAMES, number, percent, unit_text
+from carlab.diagnosis.report.numbers import number, percent, unit_text
+from carlab.diagnosis.report.sentences import CHANNEL_NAMES
 from carlab.diagnosis.report.svg import Chart, bar_rows, padded
 
 MODELS = ("nominal", "refit", "with_effects")

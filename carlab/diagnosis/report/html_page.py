@@ -15,6 +15,7 @@ from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve
 from carlab.diagnosis.report.drift import drift_sentences
 from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
+from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.residual import explained_share, formula_symbols, relevant_residual, shown_errors
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import EVIDENCE, REPORT
@@ -24,9 +25,9 @@ def render_page(diagnosis: Diagnosis, figure_data: FigureData) -> str:
     """Render the page: self-contained, without scripts; all text from outside is escaped."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
-        "num": text.number,
-        "percent": text.percent,
-        "unit": text.unit_text,
+        "num": number,
+        "percent": percent,
+        "unit": unit_text,
         "words": lambda name: name.replace("_", " "),
     }
     source = (resources.files("carlab.diagnosis.report") / "templates" / "report.html").read_text(encoding="utf-8")
@@ -69,11 +70,10 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),
         "rest": rest,
-        "rest_where": text.listed([text.CHANNEL_NAMES.get(c, c) for c in rest.channels]) if rest else "",
+        "rest_where": listed([text.CHANNEL_NAMES.get(c, c) for c in rest.channels]) if rest else "",
         "rest_symbols": formula_symbols(rest.formula) if rest else "",
         "rest_regime": text.regime_clause(rest.regime) if rest else "",
         "drive": command,
-        "drive_name": drive,
         "why": why.removesuffix(f" Drive it with: {command}"),
         "held_out": shown_errors(diagnosis),
         "parameters": [
@@ -84,7 +84,6 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
             for effect, own in diagnosis.limits.items()
             for name, e in own.items()
         ],
-        "channels": text.CHANNEL_NAMES,
     }
 
 
@@ -101,14 +100,14 @@ def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     where, evidence = effect.where, effect.evidence
-    places = [f"in {text.listed([text.CHANNEL_NAMES.get(c, c) for c in where.channels])}"] if where.channels else []
+    places = [f"in {listed([text.CHANNEL_NAMES.get(c, c) for c in where.channels])}"] if where.channels else []
     places.append(text.regime_clause(where.regime))
     if where.lag_s is not None:
-        places.append(f"at a lag of {text.with_unit(where.lag_s, 's')}")
+        places.append(f"at a lag of {with_unit(where.lag_s, 's')}")
     if where.time is not None:
-        places.append(f"from {text.with_unit(where.time[0], 's')} to {text.with_unit(where.time[1], 's')}")
+        places.append(f"from {with_unit(where.time[0], 's')} to {with_unit(where.time[1], 's')}")
     if where.place is not None:
-        x, y, radius = (text.with_unit(v, "m") for v in where.place)
+        x, y, radius = (with_unit(v, "m") for v in where.place)
         places.append(f"within {radius} of x = {x}, y = {y}")
     noun = text.effect_noun(effect.id)
     return {
@@ -118,7 +117,6 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
         "confidence": effect.confidence,
         "confidence_text": text.confidence_text(effect.confidence, len(effect.indistinguishable_from)),
         "where": ", ".join(places),
-        "evidence": evidence,
         "evidence_texts": _evidence_texts(effect),
         "parameters": [(name, e, _bar(e)) for name, e in effect.parameters.items()],
         "others": [(other, text.effect_noun(other)) for other in effect.indistinguishable_from],
@@ -138,16 +136,16 @@ def _evidence_texts(effect: EffectFinding) -> list[str]:
     fall = evidence.held_out_error_reduction
     if math.isfinite(fall):
         verb = "lowers" if fall >= 0 else "raises"
-        texts.append(f"Added last, the effect {verb} the error on held-out recordings by {text.percent(abs(fall))}.")
+        texts.append(f"Added last, the effect {verb} the error on held-out recordings by {percent(abs(fall))}.")
     strength = evidence.standard_errors
     if math.isfinite(strength):
         verb = "lowers" if strength < 0 else "raises"
         weak = " (weak evidence)" if abs(strength) < 3 else ""
-        size = text.number(abs(strength))
+        size = number(abs(strength))
         texts.append(f"The effect {verb} the held-out log-likelihood by {size} standard errors{weak}.")
     visible = evidence.visibility
     if math.isfinite(visible):
         hidden = " Most of it is confounded with other parameters." if visible < 0.3 else ""
-        share = text.percent(visible)
+        share = percent(visible)
         texts.append(f"Other parameters cannot reproduce {share} of its influence on the errors.{hidden}")
     return texts

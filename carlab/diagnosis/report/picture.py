@@ -12,8 +12,7 @@ from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
 from carlab.diagnosis.settings import REPORT
 from carlab.recording.rerun import blueprint
 
-ORDER = ("nominal", "refit", "with_effects")
-LABELS = {"nominal": "car file", "refit": "refit", "with_effects": "with effects"}
+LABELS = {"refit": "refit", "with_effects": "with effects"}
 
 
 def _escaped(text: str) -> str:
@@ -75,10 +74,10 @@ def _worst(axes: Axes, trace: Trace) -> None:
         rows = (trace.times_s >= begin - 1e-6) & (trace.times_s < end - 1e-6)  # the prediction restarts at the end
         has_label = number == 0
         axes.plot(*trace.recorded[rows, :2].T, color="black", lw=2.2, label="recorded" if has_label else None)
-        for name in ORDER[1:]:
+        for name, label in LABELS.items():
             if name in trace.predicted:
                 path = trace.predicted[name][rows, :2]
-                axes.plot(*path.T, color=COLORS[name], lw=1.6, label=LABELS[name] if has_label else None)
+                axes.plot(*path.T, color=COLORS[name], lw=1.6, label=label if has_label else None)
         axes.plot(*trace.recorded[np.argmax(rows), :2], "o", color="black", ms=5)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")

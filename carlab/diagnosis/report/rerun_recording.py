@@ -24,7 +24,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
 from carlab.diagnosis.report.events import event_label
 from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
-from carlab.diagnosis.report.sentences import number
+from carlab.diagnosis.report.numbers import number
 from carlab.recording.atomic_files import rerun_file
 from carlab.recording.rerun import blueprint
 from carlab.recording.rerun.columns import Columns, entity_part, yaw_quaternion

@@ -11,11 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
-from carlab.diagnosis.report.numbers import listed as listed
-from carlab.diagnosis.report.numbers import number as number
-from carlab.diagnosis.report.numbers import percent as percent
-from carlab.diagnosis.report.numbers import unit_text as unit_text
-from carlab.diagnosis.report.numbers import with_unit as with_unit
+from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, parameters_at_limit, wrong_parameters
 from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences

@@ -13,16 +13,16 @@ import numpy as np
 import tomli_w
 
 from carlab.core.recording_noise import RecordingNoise
+from carlab.diagnosis.curves.support import MEASURED_CURVES
 from carlab.diagnosis.decisions import to_dict
 from carlab.diagnosis.findings import Diagnosis, FigureData
-from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.html_page import render_page
+from carlab.diagnosis.report.numbers import listed, number
 from carlab.diagnosis.report.picture import draw_picture
 from carlab.diagnosis.report.rerun_recording import write_rrd
 from carlab.recording.atomic_files import write_text
 from carlab.recording.sink import make_folder, writing
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.registry import REGISTRY
 
 JSON_NAME, HTML_NAME, RRD_NAME, MODEL_NAME = "report.json", "report.html", "report.rrd", "model.toml"
@@ -74,18 +74,18 @@ def write_decisions(figure_data: FigureData, folder: Path) -> Path:
 def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoise | None) -> str:
     """The simulator as a car file with the noise of the recordings; comments state the origin of its numbers."""
     fitted = [use.path for use in diagnosis.recordings if use.role == "fit" and diagnosis.parameters]
-    found = text.listed([effect.id for effect in diagnosis.effects])
+    found = listed([effect.id for effect in diagnosis.effects])
     held = diagnosis.held_out
     lines = ["Car file written by carlab diagnose; use it with --car, or diagnose again from it."]
     lines.append(f"Verdict: {diagnosis.verdict}." + (f" Named effects: {found}." if found else " No named effects."))
     for effect in diagnosis.effects:
         lines.append(effect.sentence)
         if effect.indistinguishable_from:
-            others = text.listed(list(effect.indistinguishable_from), "or")
+            others = listed(list(effect.indistinguishable_from), "or")
             lines.append(f"These recordings do not distinguish {effect.id} from {others}.")
     lines += [f"Fitted to: {path}" for path in fitted] or ["Not fitted: the car file as given."]
     scores = [
-        f"{name} {text.number(held[name].score)}"
+        f"{name} {number(held[name].score)}"
         for name in ("nominal", "refit", "with_effects", "with_uncatalogued_physics", "with_curves")
         if name in held
     ]
@@ -122,10 +122,8 @@ def _curve_std(diagnosis: Diagnosis, known: Mapping[str, float]) -> dict[str, fl
     """Standard deviations of measured curves at knots with data, by dotted name."""
     found: dict[str, float] = {}
     for curve in diagnosis.curves:
-        effect = EFFECTS[curve.id]
-        if isinstance(effect, MeasuredCurve):
-            own = effect.numbers_of_table(np.nan_to_num(curve.std).tolist()) or {}
-            found |= {f"effects.{curve.id}.{name}": std for name, std in own.items() if std > 0.0}
+        own = MEASURED_CURVES[curve.id].numbers_of_table(np.nan_to_num(curve.std).tolist()) or {}
+        found |= {f"effects.{curve.id}.{name}": std for name, std in own.items() if std > 0.0}
     return {name: std for name, std in found.items() if name in known}
 
 

@@ -37,16 +37,10 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
 
 
 def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], control: RunControl) -> Model | None:
-    """Replace an effect of the model by a confusable effect with which the loss is significantly lower.
+    """The model with one effect replaced by a confusable effect with which the loss is significantly lower.
 
-    Args:
-        problem: the search problem.
-        model: the model.
-        reduced: for each effect that may be replaced, the model refitted without it.
-        control: workers, which share the fits of all confusable effects.
-
-    Returns:
-        The model with the first such replacement, in the order of ``reduced``; None if there is none.
+    ``reduced`` has the model without each effect that may be replaced, refitted. The first replacement in its order is
+    made; None if there is none.
     """
     settings = problem.settings.selection
     pairs = [
@@ -61,17 +55,14 @@ def _swap(problem: SearchProblem, model: Model, reduced: Mapping[str, Model], co
     arguments = [(problem, model, reduced[name], screens[name], other) for name, other in pairs]
     swaps = control.workers.map(_fitted_swap, arguments, stop=control.ends_search)
     for (name, _), swap in zip(pairs, swaps, strict=True):
-        if swap is not None and swap[1] > settings.keep_chi2_min + _additional_chi2(problem, swap[0].effect, name):
-            candidate, chi2 = swap
+        if swap is None:
+            continue
+        candidate, chi2 = swap
+        more_numbers = max(len(numbers_of(candidate.effect)) - len(numbers_of(name)), 0)
+        if chi2 > settings.keep_chi2_min + settings.accept_chi2_per_number * more_numbers:
             log.info("%s replaces %s (chi2 %.1f)", candidate.effect, name, chi2)
             return fit_with_scale(problem, (*reduced[name].effects, candidate.effect), candidate.fit.z)
     return None
-
-
-def _additional_chi2(problem: SearchProblem, new: str, old: str) -> float:
-    """Additional minimum chi2 of a swap to an effect with more numbers."""
-    more = len(numbers_of(new)) - len(numbers_of(old))
-    return problem.settings.selection.accept_chi2_per_number * max(more, 0)
 
 
 def _fitted_swap(

@@ -23,8 +23,7 @@ from carlab.diagnosis.identification.fit_parameters import (
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION, DiagnosisSettings
 from carlab.jobs.function_workers import FunctionWorkers
-from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import simulate_windows
+from carlab.prediction.errors import simulation_errors
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS, EffectParameter
@@ -68,8 +67,7 @@ class SearchProblem:
 
     def scale_of(self, config: SimulatorConfig, values: Mapping[str, FloatArray] | None = None) -> Scale:
         """Scale of the errors of a simulator on the windows, with other ``values`` (1,) by dotted name."""
-        predicted = simulate_windows(self.windows, config, values)
-        return Scale.of(prediction_errors(predicted, self.windows)[0], self.floor)
+        return Scale.of(simulation_errors(self.windows, config, values), self.floor)
 
     def config_with(self, effects: Sequence[str]) -> SimulatorConfig:
         """The simulator with ``effects`` added, at the values of the car file or else at their identity values.
@@ -84,11 +82,6 @@ class SearchProblem:
         for name in effects:
             config = with_effect(config, name)
         return config
-
-    def nominal_coordinates(self, free: Sequence[FitParameter]) -> FloatArray:
-        """Coordinates (n,) of n parameters at the values of the car file; 0 without a value."""
-        values = self.nominal.values()
-        return np.array([f.coordinate(values[f.name]) if f.name in values else 0.0 for f in free])
 
     def is_candidate(self, effect: str) -> bool:
         """Whether the effect may be accepted."""

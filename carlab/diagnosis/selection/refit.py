@@ -10,7 +10,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
-from carlab.diagnosis.identification.fit_parameters import FitParameter, values_at
+from carlab.diagnosis.identification.fit_parameters import FitParameter, coordinates_in, values_at
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
 
@@ -152,4 +152,4 @@ def fit_with_scale(
 
 def fit_base(problem: SearchProblem) -> Model:
     """Fit the base parameters alone."""
-    return fit_with_scale(problem, (), problem.nominal_coordinates(problem.free_parameters(())))
+    return fit_with_scale(problem, (), coordinates_in(problem.nominal, problem.free_parameters(())))

@@ -133,15 +133,10 @@ def _passes(
 
 
 def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings) -> tuple[Condition, ...]:
-    """Conditions of a replacement, by the number of its effects.
+    """Conditions of a replacement by which the loss on left-out blocks falls by ``z`` standard errors.
 
     An additional effect needs the significance of any accepted effect. An equal number needs a lower loss on left-out
     blocks. Fewer effects need a loss that is not significantly higher.
-
-    Args:
-        replacement: the new and the old effects.
-        z: fall of the loss on left-out blocks [standard errors].
-        settings: thresholds.
     """
     if len(replacement.new) > len(replacement.old):
         return (

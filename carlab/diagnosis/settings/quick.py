@@ -42,8 +42,6 @@ class QuickSettings:
     """Number of iterations of a fit."""
     half_fit_iterations: int = 4
     """Number of iterations of a fit to half of the windows, which starts from the fit to all windows."""
-    used_steps: int = 6
-    """Number of steps of a window whose errors enter a fit."""
     single_cause_share: float = 0.8
     """If one cause explains this share of the excess, the parameters are not refitted."""
     min_share: float = 0.1

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from carlab.core.quantities import STATE_NAMES, FloatArray
-from carlab.diagnosis.findings import Unexplained
+from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.selection.screening import Screen
@@ -86,28 +85,15 @@ class _Library:
     labels: tuple[tuple[Term, int, float], ...]
 
 
-def fit_residual_terms(
-    windows: PredictionWindows,
-    fit: Fit,
-    scale: Scale,
-    term_chi2_min: float | None = None,
-) -> ResidualModel:
-    """Forward selection of unnamed terms in addition to ``fit``.
-
-    Args:
-        windows: windows of the fit.
-        fit: fit with the accepted effects.
-        scale: error scale.
-        term_chi2_min: minimum chi2 of a term; by default that of the settings.
-    """
-    fitter = Fitter(windows, scale)
+def fit_residual_terms(fitter: Fitter, fit: Fit, term_chi2_min: float = UNEXPLAINED.term_chi2_min) -> ResidualModel:
+    """Forward selection of unnamed terms with at least the chi2 ``term_chi2_min`` in addition to ``fit``."""
+    windows, scale = fitter.windows, fitter.scale
     screen = Screen(fitter, fit.config, fit)
     design_effect = fitter.with_covariance(fit).design_effect
     library = _library(windows, fit, scale, screen)
     if library is None:
         return ResidualModel(())
-    min_gain = UNEXPLAINED.term_chi2_min if term_chi2_min is None else term_chi2_min
-    picked, gains = _select(library, screen.residual, min_gain, design_effect)
+    picked, gains = _select(library, screen.residual, term_chi2_min, design_effect)
     if not picked:
         return ResidualModel(())
     columns, labels = library.columns, library.labels
@@ -166,29 +152,6 @@ def _yaw_per_side_acceleration(config: SimulatorConfig) -> tuple[float, float]:
     values = config.values()
     per_inertia = values["vehicle.mass"] / values["vehicle.yaw_inertia"]
     return per_inertia * values["vehicle.front_axle"], -per_inertia * values["vehicle.rear_axle"]
-
-
-def describe(
-    share: float,
-    statement: str,
-    formula: str,
-    channel_errors_sq: FloatArray,
-    window_errors: FloatArray,
-    features: dict[str, FloatArray],
-) -> Unexplained:
-    """Entry of the report for the unexplained residual.
-
-    Args:
-        share: unexplained share of the squared excess.
-        statement: class of the missing physics.
-        formula: formula of the missing accelerations.
-        channel_errors_sq: squared error of the missing physics in each channel (6,), in squared noise floors.
-        window_errors: error of each held-out window (S,) [noise floors].
-        features: features at the starts of the held-out windows, each (S,).
-    """
-    order = np.argsort(-channel_errors_sq)
-    channels = tuple(STATE_NAMES[k] for k in order if channel_errors_sq[k] > 0.5 * channel_errors_sq[order[0]])
-    return Unexplained(share, channels, worst_regime(features, window_errors), statement, formula)
 
 
 def start_features(windows: PredictionWindows) -> dict[str, FloatArray]:

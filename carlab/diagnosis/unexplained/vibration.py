@@ -33,18 +33,16 @@ class Vibration:
     periods_per_m     spatial frequency [1/m]
     amplitude   (6,)  at the median speed, in the channel's SI unit; a lower bound
     ratio       (6,)  power over the mean power of all lines
-    min_ratio         ratio at which a channel counts as vibrating
     """
 
     periods_per_m: float
     amplitude: FloatArray
     ratio: FloatArray
-    min_ratio: float
 
     def class_statement(self) -> str:
         """Class of the physics."""
         radius_mm = 1e3 / (2.0 * np.pi * self.periods_per_m)
-        channels = [STATE_NAMES[k] for k in (5, 4, 3, 2) if self.ratio[k] > self.min_ratio]
+        channels = [STATE_NAMES[k] for k in (5, 4, 3, 2) if self.ratio[k] > UNEXPLAINED.vibration_ratio_min]
         return (
             f"vibration in {', '.join(channels)}: {self.periods_per_m:.3g} periods per metre travelled, with an "
             f"amplitude that grows with speed, as of an unbalanced or bent wheel of {radius_mm:.0f} mm radius"
@@ -93,7 +91,7 @@ def find_vibration(segments: Sequence[RecordingSegment]) -> Vibration | None:
         return None
     median_mps = float(np.median(np.concatenate([segment.speed for segment in segments])))
     amplitude = 2.0 * np.sqrt(strength[:, line] / blocks) * median_mps
-    return Vibration(float(PERIODS_PER_M[line]), amplitude, power[:, line] / blocks, UNEXPLAINED.vibration_ratio_min)
+    return Vibration(float(PERIODS_PER_M[line]), amplitude, power[:, line] / blocks)
 
 
 def _lines(frequencies: FloatArray, at: FloatArray) -> NDArray[np.complex128]:
