@@ -70,9 +70,7 @@ def assigned(
         fitted, validated = _episodes_of_run(item)
         to_fit += fitted
         to_validate += validated
-    if same := _paths_of(to_fit) & _paths_of(to_validate):
-        raise ConfigError(f"{min(same).name} is both fitted and held out; remove it from one of the lists.")
-    _check_repetition([*to_fit, *to_validate])
+    _check_repetition(to_fit, to_validate, "is both fitted and held out; remove it from one of the lists")
     return to_fit, to_validate
 
 
@@ -84,20 +82,24 @@ def recordings_of_runs(
     for items in (first, second):
         resolved = [_episodes_of_run(item) for item in items]
         groups.append([recording for fitted, validated in resolved for recording in (*fitted, *validated)])
-    if same := _paths_of(groups[0]) & _paths_of(groups[1]):
-        raise ConfigError(f"{min(same).name} is in both groups; remove it from one of them.")
-    for group in groups:
-        _check_repetition(group)
+    _check_repetition(groups[0], groups[1], "is in both groups; remove it from one of them")
     return groups[0], groups[1]
 
 
-def _check_repetition(items: Iterable[RecordingSource]) -> None:
-    """Raise ConfigError if a file is given twice, for example by itself and by its run folder."""
+def _check_repetition(first: list[RecordingSource], second: list[RecordingSource], in_both: str) -> None:
+    """Raise ConfigError with ``in_both`` for a file in both lists, and for one that is given twice.
+
+    A file may be given by itself and by its run folder.
+    """
+    paths = [[path for item in items if (path := _path_of(item))] for items in (first, second)]
+    of_first, of_second = ({path.resolve() for path in items} for items in paths)
+    if same := of_first & of_second:
+        raise ConfigError(f"{min(same).name} {in_both}.")
     known: set[Path] = set()
-    for path in (_path_of(item) for item in items):
-        if path is not None and path.resolve() in known:
+    for path in (*paths[0], *paths[1]):
+        if path.resolve() in known:
             raise ConfigError(f"{path} is given twice; name it once.")
-        known |= {path.resolve()} if path is not None else set()
+        known.add(path.resolve())
 
 
 def check_contents(uses: Iterable[RecordingUse]) -> None:
@@ -107,10 +109,6 @@ def check_contents(uses: Iterable[RecordingUse]) -> None:
         if use.sha256 in known:
             raise ConfigError(f"{use.path} has the content of {known[use.sha256]}; name one of them.")
         known[use.sha256] = use.path
-
-
-def _paths_of(items: Iterable[RecordingSource]) -> set[Path]:
-    return {path.resolve() for item in items if (path := _path_of(item))}
 
 
 def _episodes_of_run(item: RecordingSource) -> tuple[Sequence[RecordingSource], Sequence[RecordingSource]]:

@@ -10,10 +10,9 @@ import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
-from carlab.diagnosis.identification.block_jackknife import interval_quantile
+from carlab.diagnosis.identification.block_jackknife import clustered_gain, interval_quantile
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.fit_parameters import FitParameter, stated_values
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Skill
-from carlab.diagnosis.identification.gains import clustered_gain
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.settings import EVIDENCE
 from carlab.prediction.windows import MIN_HISTORY_S, PredictionWindows, history_rows
 

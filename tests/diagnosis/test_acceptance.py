@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from carlab.diagnosis.decisions import Decision, passes
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.candidates import acceptance, accepted, is_accepted
 from carlab.diagnosis.selection.elimination import Deletion, EliminationResult, eliminate
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem

@@ -32,8 +32,8 @@ from carlab.diagnosis.comparison.linear_change import (
 )
 from carlab.diagnosis.comparison.result import Change, Comparison, ComparisonVerdict, Tested, verdict_sentence
 from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.fit import Fitter
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.settings import COMPARISON
 from carlab.diagnosis.state_alignment import naming_lost_frames
 from sim_backends.car_parameters import SimulatorConfig

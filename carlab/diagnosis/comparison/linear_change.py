@@ -65,12 +65,6 @@ class LinearChange:
     difference: Difference
 
     @property
-    def z(self) -> FloatArray:
-        """Estimated coordinates (n,) of the second group."""
-        at = self.secants.at
-        return np.asarray(at.z0 + self.difference.step * (at.points[self.point] - at.z0))
-
-    @property
     def p_value(self) -> float:
         """P-value of no change, for this candidate alone."""
         return p_value(self.difference, self.difference.likelihood_ratio, len(self.secants.at.z0))
@@ -78,7 +72,8 @@ class LinearChange:
     def tested(self) -> Tested:
         """For the report."""
         at = self.secants.at
-        values = size_of(at.candidate, self.z, at.z0).tolist()
+        z = at.z0 + self.difference.step * (at.points[self.point] - at.z0)
+        values = size_of(at.candidate, z, at.z0).tolist()
         names = [short_name(f.name) for f in at.candidate.free]
         return Tested(at.candidate.id, dict(zip(names, values, strict=True)), self.difference.standard_errors)
 

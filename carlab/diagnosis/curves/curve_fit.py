@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.diagnosis.findings import RejectedCurves
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.fit_parameters import numbers_at
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
 

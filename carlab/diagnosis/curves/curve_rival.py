@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 
 from carlab.diagnosis.decisions import Alternatives, Condition
-from carlab.diagnosis.identification.gains import clustered_gain
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.rival_physics import RivalPhysics

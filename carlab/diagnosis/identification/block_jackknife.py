@@ -1,4 +1,4 @@
-"""Covariance of fitted parameters by blocks of the recording.
+"""Covariance of fitted parameters, and standard errors of gains, by blocks of the recording.
 
 Errors of a block are dependent, so blocks count as independent, not rows. A few blocks, such as those with slides,
 determine some parameters. The usual sandwich estimate (White 1980; Liang and Zeger 1986) ignores how strongly a fit
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from carlab.core.quantities import FloatArray
+from carlab.prediction.windows import PredictionWindows
 
 
 def jackknife_covariance(information: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:
@@ -61,6 +62,15 @@ def sandwich_design_effects(information: FloatArray, scores: FloatArray, precisi
     changes = scores @ independent
     variance = count / max(count - 1, 1) * (changes**2).sum(axis=0)
     return np.asarray(variance / np.maximum(np.diag(independent), 1e-30))
+
+
+def clustered_gain(before: FloatArray, after: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
+    """Fall of the loss from ``before`` to ``after`` (S,) and its standard error, clustered by block."""
+    gain = before - after
+    blocks, index = np.unique(windows.block, return_inverse=True)
+    sums = np.bincount(index, weights=gain, minlength=len(blocks))
+    error = math.sqrt(len(blocks)) * float(sums.std(ddof=1)) if len(blocks) > 1 else math.inf
+    return float(gain.sum()), max(error, 1e-9)
 
 
 def interval_quantile(blocks: int, probability: float) -> float:

@@ -37,7 +37,7 @@ class Scale:
 
     @classmethod
     def of_floor(cls, floor: FloatArray) -> Scale:
-        """The noise floor (K + 1, 6) along a window."""
+        """The scale of a perfect simulator, by the noise floor (K + 1, 6) along a window."""
         steps = _loss_steps(len(floor) - 1)
         return cls(steps, floor[steps])
 

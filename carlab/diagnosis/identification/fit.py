@@ -67,6 +67,19 @@ class Fit:
             return 1.0
         return max(1.0, float(np.median(self.design_effects)))
 
+    def design_effect_of(self, effect: str) -> float:
+        """Design effect of an effect's parameters: variance by blocks over that for independent errors, at least one.
+
+        Twice the gain of several parameters is a sum of chi-squares weighted by such ratios, so their mean divides it
+        (Kent 1982). The median of all parameters replaces it if that of the effect is undefined (a limit never
+        reached).
+        """
+        assert self.design_effects is not None
+        prefix = f"effects.{effect}."
+        of_parameters = zip(self.free, self.design_effects, strict=True)
+        own = [float(d) for f, d in of_parameters if f.name.startswith(prefix) and d > 1e-9]
+        return max(self.design_effect, float(np.mean(own)) if own else 0.0)
+
     def values(self) -> dict[str, float]:
         """Fitted values by dotted name."""
         return numbers_at(self.free, self.z)

@@ -11,8 +11,8 @@ from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.core.recording_noise import RecordingNoise, StateStd
 from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.findings import FitErrors
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.error_scale import huber
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.identification.measurement_noise import Noise
 from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import final_errors, prediction_errors

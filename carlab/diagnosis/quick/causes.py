@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import (
@@ -24,7 +25,6 @@ from carlab.diagnosis.identification.fit_parameters import (
     stated_parameters,
     with_effect,
 )
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.problem import is_applicable
 from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import QUICK

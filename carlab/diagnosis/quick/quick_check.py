@@ -150,12 +150,12 @@ def _checked(
 ) -> QuickCheck:
     """Check windows with their noise floor (K + 1, 6)."""
     final = bounded(simulation_errors(windows, simulator)[:, -1] / floor[-1], QUICK.max_error)
-    score, score_std = _score(final, windows)
+    score, score_std, blocks_above = _score(final, windows)
     channels = _channels(final, floor[-1])
     scored = replace(undecided, score=score, score_std=score_std, channels=channels, windows=len(windows))
     if score <= QUICK.score_max:
         return replace(scored, verdict="explains")
-    if _blocks_above(final, windows, QUICK.score_max) < QUICK.min_blocks:
+    if blocks_above < QUICK.min_blocks:
         why = "the errors exceed the noise in one stretch only, which may be an outlier."
         return replace(scored, why=why)
     worst = STATE_NAMES.index(channels[0].channel)
@@ -179,23 +179,16 @@ def _windows(
     return windows, noise_floor(windows, estimate_noise(segments, windows.curvature_bias), simulator)
 
 
-def _score(final: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
-    """Score of errors (S, 6) in noise floors, and its jackknife standard error over blocks."""
+def _score(final: FloatArray, windows: PredictionWindows) -> tuple[float, float, int]:
+    """Score of errors (S, 6) in noise floors, its jackknife standard error over blocks, and blocks above the limit."""
     squared = np.mean(final**2, axis=1)
-    blocks, index = np.unique(windows.block, return_inverse=True)
-    if len(blocks) < 2:
-        return float(np.sqrt(squared.mean())), float("inf")
+    index = np.unique(windows.block, return_inverse=True)[1]
     sums, counts = np.bincount(index, weights=squared), np.bincount(index)
+    score, blocks_above = float(np.sqrt(squared.mean())), int(np.sum(np.sqrt(sums / counts) > QUICK.score_max))
+    if len(counts) < 2:
+        return score, float("inf"), blocks_above
     without = np.sqrt((squared.sum() - sums) / (len(squared) - counts))
-    standard_error = np.sqrt((len(blocks) - 1) * without.var())
-    return float(np.sqrt(squared.mean())), float(standard_error)
-
-
-def _blocks_above(final: FloatArray, windows: PredictionWindows, score_max: float) -> int:
-    """Number of blocks whose score is above ``score_max``."""
-    _, index = np.unique(windows.block, return_inverse=True)
-    squared = np.bincount(index, weights=np.mean(final**2, axis=1)) / np.bincount(index)
-    return int(np.sum(np.sqrt(squared) > score_max))
+    return score, float(np.sqrt((len(counts) - 1) * without.var())), blocks_above
 
 
 def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelScore, ...]:

@@ -14,8 +14,8 @@ from typing import TypeVar
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Alternatives, Condition, Decision, passes
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.error_scale import Scale
-from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import begin_refit, finish_refit
 from carlab.diagnosis.selection.screening import ScreeningResult, screen_candidates
@@ -135,7 +135,7 @@ def with_left_out_gain(problem: SearchProblem, scale: Scale, candidate: Candidat
     fit = fitter.with_covariance(candidate.fit, linearisation)
     loss = problem.left_out_loss(fit, scale, linearisation)
     gain, error = clustered_gain(reference, loss, problem.windows)
-    chi2 = 2.0 * candidate.gain / design_effect_of(fit, candidate.effect)
+    chi2 = 2.0 * candidate.gain / fit.design_effect_of(candidate.effect)
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
 
 

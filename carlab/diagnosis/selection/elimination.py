@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from carlab.diagnosis.decisions import Condition, Decision
-from carlab.diagnosis.identification.gains import clustered_gain
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit_without_each
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.fit import Fit
-from carlab.diagnosis.identification.gains import clustered_gain
 from carlab.diagnosis.selection.candidates import accepted, next_candidates
 from carlab.diagnosis.selection.moves import apply_moves
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from carlab.diagnosis.identification.gains import design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, numbers_of
 from carlab.diagnosis.selection.refit import fit_with_scale, refit_candidate, refit_without_each
 from carlab.diagnosis.selection.screening import Screen, screen_of
@@ -24,7 +23,7 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
     significant: dict[str, Model] = {}
     without_each = refit_without_each(problem, model, control, model.effects[:-1], is_comparison=True)
     for name, reduced in without_each.items():
-        chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(with_covariance, name)
+        chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / with_covariance.design_effect_of(name)
         if chi2 < problem.settings.selection.keep_chi2_min:
             swapped = _swap(problem, model, significant, control)
             if swapped is not None:
@@ -76,5 +75,5 @@ def _fitted_swap(
     if screened.score < problem.settings.selection.swap_score_share * (reduced.fit.cost - model.fit.cost):
         return None
     candidate = refit_candidate(problem, reduced, screened)
-    design_effect = design_effect_of(problem.fitter(model.scale).with_covariance(candidate.fit), other)
+    design_effect = problem.fitter(model.scale).with_covariance(candidate.fit).design_effect_of(other)
     return candidate, 2.0 * (model.fit.cost - candidate.fit.cost) / design_effect

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
@@ -74,7 +74,7 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
     chi2, indistinguishable, replacements = {}, {}, {}
     for name in model.effects:
         gain = eliminated.deletions[name].without.fit.cost - model.fit.cost
-        chi2[name] = 2.0 * gain / design_effect_of(with_covariance, name)
+        chi2[name] = 2.0 * gain / with_covariance.design_effect_of(name)
         compared = []
         for candidate, loss in fitted[name]:
             difference, error = clustered_gain(loss, own_loss, problem.windows)

@@ -18,8 +18,8 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.fit import Fit
-from carlab.diagnosis.identification.gains import clustered_gain, design_effect_of
 from carlab.diagnosis.selection.elimination import EliminationResult, eliminate
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit
@@ -113,7 +113,7 @@ def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict
     fitter, settings = problem.fitter(model.scale), problem.settings.selection
     fit = fitter.fit(problem.config_with(effects), free, start)
     with_covariance = fitter.with_covariance(fit)
-    chi2 = 2.0 * (model.fit.cost - fit.cost) / max(design_effect_of(with_covariance, e) for e in new)
+    chi2 = 2.0 * (model.fit.cost - fit.cost) / max(with_covariance.design_effect_of(e) for e in new)
     if chi2 < (settings.accept_chi2_min if len(new) > len(old) else -settings.accept_chi2_min):
         return None
     return _Replacement(old, tuple(new), fit, chi2, problem.left_out_loss_of_free_states(fit, model.scale))
