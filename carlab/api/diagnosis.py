@@ -86,6 +86,11 @@ class DiagnosisReport:
         return {effect: dict(own) for effect, own in self.diagnosis.limits.items()}
 
     @property
+    def withdrawn(self) -> dict[str, str]:
+        """Effects that the search accepted and a later test withdrew: the reason by id."""
+        return {effect.id: effect.reason for effect in self.diagnosis.withdrawn}
+
+    @property
     def held_out(self) -> dict[str, FitErrors]:
         """Held-out root mean square errors by model, as ``fit.held_out`` of report.json."""
         return dict(self.diagnosis.held_out)

@@ -82,6 +82,7 @@ class Diagnose:
         from carlab.diagnosis.report.events import diagnosed_event_sentences
         from carlab.diagnosis.report.numbers import percent
         from carlab.diagnosis.report.residual import shown_errors
+        from carlab.diagnosis.report.sentences import withdrawal_sentences
 
         others = [fault for fault in diagnosis.data_faults if fault.id != INCOMPLETE_FILE]
         if others:
@@ -90,6 +91,7 @@ class Diagnose:
         console.print(diagnosis.sentence)
         sentences = [effect.sentence for effect in diagnosis.effects] + curve_sentences(diagnosis)
         sentences += [ceiling_sentence(diagnosis), *drift_sentences(diagnosis), *diagnosed_event_sentences(diagnosis)]
+        sentences += withdrawal_sentences(diagnosis)
         for sentence in filter(None, sentences):
             console.print(f"  {sentence}")
         share = diagnosis.held_out_share

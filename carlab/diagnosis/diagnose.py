@@ -25,7 +25,7 @@ from carlab.diagnosis.final_models import (
     measured_curves,
     trained_models,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, final_model_name
+from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, Withdrawal, final_model_name
 from carlab.diagnosis.identification.held_out_errors import HeldOut, mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -49,6 +49,7 @@ from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import naming_lost_frames, with_known_latency
 from carlab.diagnosis.uncertain_effects import without_uncertain_effects
 from carlab.diagnosis.unexplained.vibration import find_vibration
+from carlab.diagnosis.withdrawals import withdrawn_effects
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.network_ensemble import EnsembleSettings, check_duration
 from carlab.prediction.predict import PredictiveModel
@@ -101,7 +102,8 @@ def diagnose(
         nominal: the simulator of the car file.
         uses: role of each recording, for the report.
         data_faults: faults that were found when the files were read; faults found here are added.
-        effects: candidate effects, the whole catalogue by default. Requested ones are withdrawn by held-out error only.
+        effects: candidate effects, the whole catalogue by default. Physics outside the catalogue withdraws no requested
+            effect.
         holdout_share: last share of each recording that is held out without ``held_out``; default: of the settings.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
@@ -128,8 +130,9 @@ def diagnose(
     with FunctionWorkers() if workers is None else nullcontext(workers) as shared:
         control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, shared)
         recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
-        scored, naming = _search_effects(recordings, noise, request, control, timer)
-        outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
+        accepted, scored, naming = _search_effects(recordings, noise, request, control, timer)
+        withdrawn = withdrawn_effects(decisions, accepted, scored.found.effects)
+        outcome = _assemble_result(scored, naming, withdrawn, recordings, replace(request, data_faults=faults), control)
     return _with_run(outcome, timer, effects or (), None if held_out else share, decisions)
 
 
@@ -193,8 +196,11 @@ def _estimate_noise(recordings: SplitRecordings, nominal: SimulatorConfig) -> tu
 
 def _search_effects(
     recordings: SplitRecordings, noise: Noise, request: Request, control: RunControl, timer: SearchTimer
-) -> tuple[ScoredSearch, NamingResult]:
-    """Search for effects, withdraw spurious ones, and score the result on held-out windows."""
+) -> tuple[tuple[str, ...], ScoredSearch, NamingResult]:
+    """Search for effects, withdraw spurious ones, and score the result on held-out windows.
+
+    Also returns the effects that the search accepted.
+    """
     control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, request.nominal
     floor = mean_noise_floor(windows, noise, nominal)
@@ -218,11 +224,16 @@ def _search_effects(
         if scored.found.effects != naming.found.effects:
             naming = with_fewer_effects(problem, naming, scored.found, search_control)
     timer.end_checks()
-    return scored, naming
+    return found.effects, scored, naming
 
 
 def _assemble_result(
-    scored: ScoredSearch, naming: NamingResult, recordings: SplitRecordings, request: Request, control: RunControl
+    scored: ScoredSearch,
+    naming: NamingResult,
+    withdrawn: tuple[Withdrawal, ...],
+    recordings: SplitRecordings,
+    request: Request,
+    control: RunControl,
 ) -> Outcome:
     """Compute evidence, unexplained residual, measured curves, ceiling, verdict and figure data."""
     held_out, progress = scored.held_out, control.progress
@@ -267,6 +278,7 @@ def _assemble_result(
         drift=() if adaptation is None else adaptation.drift,
         car_file_parameters=_stated_parameters(request.nominal),
         limits=effect_limits(scored, control.workers),
+        withdrawn=withdrawn,
         events=recordings.events,
         held_out_with_events=errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )

@@ -224,6 +224,14 @@ class RecordingUse:
 
 
 @dataclass(frozen=True, slots=True)
+class Withdrawal:
+    """An effect that the search accepted and a later test withdrew; ``reason`` is a clause that follows "because"."""
+
+    id: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class SearchExtent:
     """How far the search for effects went.
 
@@ -258,7 +266,8 @@ class Diagnosis:
     fitted; NaN if unknown. ``held_out_share`` is the share of the last part of each recording that is held out; None if
     whole recordings are. ``car_file_parameters`` has the value of each of the ``parameters`` in
     the car file, if it states one. ``limits`` has estimates of the effects that are not named, by effect and
-    parameter. ``curve_trial`` is None without measured curves as a stage, and if the user ended it.
+    parameter, and ``withdrawn`` the effects that the search accepted and a later test withdrew. ``curve_trial`` is None
+    without measured curves as a stage, and if the user ended it.
     """
 
     verdict: Verdict
@@ -281,6 +290,7 @@ class Diagnosis:
     drift: tuple[Drift, ...] = ()
     car_file_parameters: Mapping[str, float] = field(default_factory=dict)
     limits: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
+    withdrawn: tuple[Withdrawal, ...] = ()
     search: SearchExtent = field(default_factory=SearchExtent)
     events: EventUse = field(default_factory=EventUse)
     held_out_with_events: Mapping[str, FitErrors] = field(default_factory=dict)

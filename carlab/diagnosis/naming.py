@@ -26,7 +26,7 @@ from carlab.diagnosis.selection.rival_physics import RivalPhysics, additional_ph
 from carlab.diagnosis.selection.search import restrict
 from carlab.diagnosis.unexplained.description import ResidualModel, fit_residual_terms, start_features, worst_regime
 from carlab.diagnosis.unexplained.vibration import Vibration
-from carlab.diagnosis.weak_effects import without_harmful_effects, without_negligible_effects
+from carlab.diagnosis.weak_effects import held_out_conditions, without_harmful_effects, without_negligible_effects
 
 log = logging.getLogger(__name__)
 
@@ -68,10 +68,10 @@ def accept_names(
     residual = residual_of(problem, found)
     if rival is None:
         rival = additional_physics(problem, found, control)
-    if found.is_complete and found.effects and _are_spurious(problem, found, residual, rival, held_out, control):
-        found = found.without_effects()
-    elif found.effects and _increases_held_out_error(found, held_out):
-        log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
+    if found.effects and (
+        (found.is_complete and _are_spurious(problem, found, residual, rival, held_out, control))
+        or _increase_held_out_error(problem, found, held_out, control)
+    ):
         found = found.without_effects()
     elif found.effects:
         standing = without_harmful_effects(problem, found, held_out, control)
@@ -96,8 +96,7 @@ def accept_requested_names(
     against the accepted effects. Instead, they must hold with decorrelated errors.
     """
     found = without_unsupported_effects(problem, found, control)
-    if found.effects and _increases_held_out_error(found, held_out):
-        log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
+    if found.effects and _increase_held_out_error(problem, found, held_out, control):
         found = found.without_effects()
     elif found.effects:
         found = without_harmful_effects(problem, found, held_out, control)
@@ -194,10 +193,15 @@ def _is_irrelevant(problem: SearchProblem, found: SearchResult, gain: float) -> 
     return Condition("rivals.min_unnamed_share", share, problem.settings.rivals.min_unnamed_share, above=False)
 
 
-def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
+def _increase_held_out_error(
+    problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl
+) -> bool:
     """Whether held-out score and likelihood are both worse with the effects than with the refit alone."""
-    without, with_names = held_out.final_error(found.base.config), held_out.final_error(found.best.config)
-    return held_out.score(with_names) > held_out.score(without) and held_out.gain(without, with_names)[0] < 0.0
+    conditions = held_out_conditions(held_out, found.base, found.best, problem.settings.selection)
+    increase = not control.are_confirmed(found.effects, conditions, len(found.effects))
+    if increase:
+        log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
+    return increase
 
 
 def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl) -> bool:

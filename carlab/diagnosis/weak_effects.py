@@ -17,6 +17,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit_without_each
 from carlab.diagnosis.selection.search import with_model
+from carlab.diagnosis.settings import SelectionSettings
 from carlab.prediction.errors import simulation_errors
 
 log = logging.getLogger(__name__)
@@ -36,18 +37,22 @@ def without_harmful_effects(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl
 ) -> SearchResult:
     """Remove effects one by one that raise the held-out error when they are added last, the most harmful first."""
-    settings = problem.settings.selection
 
     def conditions(name: str, model: Model, without: Fit) -> Alternatives:
-        before, after = held_out.final_error(without.config), held_out.final_error(model.fit.config)
-        gain, error = held_out.gain(before, after)
-        rise = held_out.score(before) / max(held_out.score(after), 1e-12) - 1.0
-        return (
-            (Condition("selection.min_held_out_rise", rise, settings.min_held_out_rise),),
-            (Condition("selection.min_held_out_z", gain / error, settings.min_held_out_z),),
-        )
+        return held_out_conditions(held_out, without, model.fit, problem.settings.selection)
 
     return _with_standing_effects(problem, found, conditions, control)
+
+
+def held_out_conditions(held_out: HeldOut, without: Fit, fit: Fit, settings: SelectionSettings) -> Alternatives:
+    """Conditions that ``fit`` lowers the error on held-out recordings, by its score or by its robust likelihood."""
+    before, after = held_out.final_error(without.config), held_out.final_error(fit.config)
+    gain, error = held_out.gain(before, after)
+    rise = held_out.score(before) / max(held_out.score(after), 1e-12) - 1.0
+    return (
+        (Condition("selection.min_held_out_rise", rise, settings.min_held_out_rise),),
+        (Condition("selection.min_held_out_z", gain / error, settings.min_held_out_z),),
+    )
 
 
 def practical_size(problem: SearchProblem, model: Model, without: Fit) -> float:

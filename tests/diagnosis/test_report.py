@@ -98,7 +98,7 @@ def test_json_has_the_keys_of_the_schema_for_each_verdict(case: Diagnosis, tmp_p
     assert report["schema"] == "carlab.diagnosis/1"
     assert report["verdict"] == case.verdict
     expected = {"schema", "verdict", "effects", "parameters", "fit", "unexplained", "data_faults", "recordings"}
-    expected |= {"curves", "curve_trial", "ceiling", "skill", "drift", "events", "search", "limits"}
+    expected |= {"curves", "curve_trial", "ceiling", "skill", "drift", "events", "search", "limits", "withdrawn"}
     assert set(report) == expected | {"seed", "seconds", "sentence", "advice"}
     assert set(report["fit"]) == {"horizon_s", "fitted_score", "held_out", "held_out_share"}
     for errors in report["fit"]["held_out"].values():

@@ -79,6 +79,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "parameters": [
             (name, diagnosis.car_file_parameters.get(name), e, _bar(e)) for name, e in diagnosis.parameters.items()
         ],
+        "withdrawn": text.withdrawal_sentences(diagnosis),
         "limits": [
             (text.effect_noun(effect), f"{effect}.{name}", e, _bar(e))
             for effect, own in diagnosis.limits.items()

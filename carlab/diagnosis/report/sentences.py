@@ -131,6 +131,11 @@ def _wrong_numbers(effect_id: str, parameters: Mapping[str, Estimate], car_file_
     return f"Wrong in the car file: {effect_noun(effect_id)}: {head}{level}{tail.replace(AT_90, '')}."
 
 
+def withdrawal_sentences(diagnosis: Diagnosis) -> list[str]:
+    """A sentence for each effect that the search accepted and a later test withdrew."""
+    return [f"Withdrawn: {effect_noun(effect.id)}, because {effect.reason}." for effect in diagnosis.withdrawn]
+
+
 def refutation_sentence(effect_id: str) -> str:
     """The observation that would refute an effect."""
     effect = EFFECTS.get(effect_id)
