@@ -167,6 +167,8 @@ def test_candidate_without_a_test_has_no_gain(monkeypatch: pytest.MonkeyPatch) -
 
 def test_unit_of_a_regime_has_superscripts_as_elsewhere() -> None:
     assert regime_clause("lateral acceleration > 2 m/s2") == "mostly where lateral acceleration > 2 m/s²"
+    assert regime_clause("|steering rate| > 2.5 /s") == "mostly where |steering rate| > 2.5 /s"
+    assert regime_clause("|steering rate| > 0 /s") == "mostly while the steering changes"
 
 
 def test_car_that_changed_before_the_held_out_recordings_is_not_missing_physics() -> None:

@@ -388,7 +388,9 @@ def _inconclusive(diagnosis: Diagnosis) -> str:
 
 
 def regime_clause(regime: str) -> str:
-    """A regime as a clause: ``mostly where lateral acceleration > 2 m/s²``."""
+    """A regime as a clause: ``mostly where lateral acceleration > 2 m/s²``, ``mostly while the steering changes``."""
     if not regime or regime == "everywhere alike":
         return "equally in all driving conditions"
+    if change := re.fullmatch(r"\|(steering|throttle) rate\| > 0 /s", regime):
+        return f"mostly while the {change[1]} changes"
     return f"mostly where {unit_text(regime)}"
