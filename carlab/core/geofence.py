@@ -42,22 +42,19 @@ def contains(corners_m: Polygon, x_m: Any, y_m: Any) -> Any:
     return inside
 
 
-def free_distance_m(corners_m: Polygon, x_m: float, y_m: float, heading_rad: float) -> float:
-    """Distance [m] from a point along a heading to the polygon's nearest edge; inf if the ray meets none."""
-    direction_x, direction_y = math.cos(heading_rad), math.sin(heading_rad)
-    nearest = math.inf
-    previous_x, previous_y = corners_m[-1]
-    for corner_x, corner_y in corners_m:
-        edge_x, edge_y = corner_x - previous_x, corner_y - previous_y
-        to_x, to_y = previous_x - x_m, previous_y - y_m
-        cross = direction_x * edge_y - direction_y * edge_x
-        if abs(cross) > 1e-12:
-            along = (to_x * edge_y - to_y * edge_x) / cross
-            on_edge = (to_x * direction_y - to_y * direction_x) / cross
-            if along >= 0.0 and -1e-9 <= on_edge <= 1.0 + 1e-9:
-                nearest = min(nearest, along)
-        previous_x, previous_y = corner_x, corner_y
-    return nearest
+def free_distance_m(corners_m: Polygon, x_m: Any, y_m: Any, heading_rad: Any) -> FloatArray:
+    """Distances (...) [m] from points (...) along headings (...) to the polygon's nearest edge; inf without one."""
+    corners = np.asarray(corners_m, dtype=np.float64)
+    before = np.roll(corners, 1, axis=0)
+    edge_x, edge_y = (corners - before).T
+    to_x, to_y = before[:, 0] - np.asarray(x_m)[..., None], before[:, 1] - np.asarray(y_m)[..., None]
+    direction_x, direction_y = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
+    cross = direction_x * edge_y - direction_y * edge_x
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (to_x * edge_y - to_y * edge_x) / cross
+        on_edge = (to_x * direction_y - to_y * direction_x) / cross
+    met = (np.abs(cross) > 1e-12) & (along >= 0.0) & (on_edge >= -1e-9) & (on_edge <= 1.0 + 1e-9)
+    return np.asarray(np.where(met, along, np.inf).min(axis=-1))
 
 
 def stopping_distance_m(speed_mps: Any, reaction_s: float, deceleration_mps2: float) -> Any:
@@ -90,30 +87,12 @@ def can_stop_inside_batch(
     Returns:
         Whether each car can stop inside (n,).
     """
-    corners = corners_array(corners_m)
-    before = np.roll(corners, 1, axis=0)
-    edge = corners - before
-    to = before - places_m[:, None]  # (n, edges, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        direction = np.stack([np.cos(course_rad), np.sin(course_rad)], axis=1)[:, None]
-        cross = _cross(direction, edge)
-        along, on_edge = _cross(to, edge) / cross, _cross(to, direction) / cross
-    met = (np.abs(cross) > 1e-12) & (along >= 0.0) & (on_edge >= -1e-9) & (on_edge <= 1.0 + 1e-9)
-    free = np.where(met, along, np.inf).min(axis=1)
-    found: NDArray[np.bool_] = contains(corners_m, *places_m.T) & (needed_m < free) & (free < np.inf)
-    return found
-
-
-def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
-    found: FloatArray = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    x_m, y_m = places_m.T
+    free = free_distance_m(corners_m, x_m, y_m, course_rad)
+    found: NDArray[np.bool_] = contains(corners_m, x_m, y_m) & (needed_m < free) & (free < np.inf)
     return found
 
 
 def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) -> tuple[tuple[float, float], ...]:
     """Corners of a rectangle, counter-clockwise."""
     return ((x_low_m, y_low_m), (x_high_m, y_low_m), (x_high_m, y_high_m), (x_low_m, y_high_m))
-
-
-def corners_array(corners_m: Polygon) -> FloatArray:
-    """Corners as an array (n, 2) [m]."""
-    return np.asarray(corners_m, dtype=np.float64).reshape(-1, 2)
