@@ -46,3 +46,7 @@ class EndReason(enum.Enum):
             EndReason.POLICY_FINISHED,
             EndReason.STOP_REQUESTED,
         )
+
+    def texts(self, detail: str = "") -> dict[str, str]:
+        """Name, sentence and detail of this end, for the metadata of an episode."""
+        return {"end_reason": self.name, "end_sentence": self.value, "end_detail": detail}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -58,20 +59,16 @@ def episode_from_documents(
         states=np.array([observation.state.to_array() for observation in seen]),
         requested=np.array([tick.requested.to_array() for tick in ticks]),
         sent=np.array([tick.sent.to_array() for tick in ticks]),
-        rewards=np.array([_reward(transitions.get(tick.step)) for tick in ticks], dtype=np.float64),
+        rewards=np.array([getattr(transitions.get(tick.step), "reward", math.nan) for tick in ticks], dtype=np.float64),
         poses=_tracked_poses(seen),
         metadata={
             **(run_metadata or {}),
-            **(_started_texts(started) if started else {}),
+            **({**started.metadata, **facts_of(started), "config_toml": started.config_toml} if started else {}),
             **_ended_texts(ended),
             **({"missing_ticks": str(missing)} if missing else {}),
         },
         extra=_extra_columns(ticks, rows, extra or {}),
     )
-
-
-def _reward(transition: Transition | None) -> float:
-    return math.nan if transition is None else transition.reward
 
 
 def _observed(
@@ -132,17 +129,64 @@ def facts_of(started: EpisodeStarted) -> dict[str, str]:
     }
 
 
-def _started_texts(started: EpisodeStarted) -> dict[str, str]:
-    return {**started.metadata, **facts_of(started), "config_toml": started.config_toml}
+def started_from_texts(texts: Mapping[str, str], config_toml: str, metadata: Mapping[str, str]) -> EpisodeStarted:
+    """The EpisodeStarted of the texts of ``facts_of``. Raises KeyError or ValueError for other texts."""
+    goal = json_value(texts, "goal")
+    return EpisodeStarted(
+        episode=int(texts["episode"]),
+        t_s=float(texts["start_t_s"]),
+        wall_ns=int(texts["start_wall_ns"]),
+        car=texts["car"],
+        reality=Reality(texts["reality"]),
+        policy=texts["policy"],
+        task=texts["task"],
+        seed=int(texts["seed"]),
+        period_s=float(texts["period_s"]),
+        history_length=int(texts["history_length"]),
+        goal=None if goal is None else _numbers(goal, 3),
+        arena_m=_points(texts, "arena_m"),
+        path_m=_points(texts, "path_m"),
+        config_toml=config_toml,
+        metadata=metadata,
+    )
+
+
+def json_value(texts: Mapping[str, str], key: str) -> Any:
+    """The JSON value under ``key``. Raises KeyError if it is missing, ValueError if it is invalid."""
+    try:
+        return json.loads(texts[key])
+    except RecursionError as error:
+        raise ValueError(f"{key} is nested too deeply") from error
+
+
+def is_number(value: Any) -> bool:
+    """Whether a JSON value is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _points(texts: Mapping[str, str], key: str) -> tuple[Any, ...]:
+    points = json_value(texts, key)
+    if not isinstance(points, list):
+        raise ValueError(f"{key} is not a list")
+    return tuple(_numbers(point, 2) for point in points)
+
+
+def _numbers(value: Any, count: int) -> tuple[Any, ...]:
+    """``value`` as a tuple of ``count`` numbers; integers stay integers. Raises ValueError for other values."""
+    if not isinstance(value, list) or len(value) != count or not all(map(is_number, value)):
+        raise ValueError(f"{count} numbers are expected")
+    return tuple(value)
 
 
 def _ended_texts(ended: EpisodeEnded | None) -> dict[str, str]:
-    reason = ended.reason if ended else EndReason.CRASHED
-    texts = {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": ended.detail if ended else ""}
-    if ended:
-        texts |= {"steps": str(ended.steps), "total_reward": repr(ended.total_reward)}
-        texts |= {f"statistics.{name}": repr(value) for name, value in ended.statistics.items()}
-    return texts
+    if ended is None:
+        return EndReason.CRASHED.texts()
+    return {
+        **ended.reason.texts(ended.detail),
+        "steps": str(ended.steps),
+        "total_reward": repr(ended.total_reward),
+        **{f"{STATISTICS}{name}": repr(value) for name, value in ended.statistics.items()},
+    }
 
 
 def goal_of(metadata: Mapping[str, str]) -> tuple[float, float, float] | None:
@@ -171,7 +215,7 @@ def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
     Values that the arrays lack (times of capture, lateness) are NaN. ``features`` are empty.
     """
     texts = episode.metadata
-    yield started_from_arrays(episode)
+    yield _started_from_arrays(episode)
     late_s, policy_s = (episode.extra.get(name, np.full(episode.ticks + 1, np.nan)) for name in (LATE, POLICY_TIME))
     seen = list(_observations(episode))
     nothing = np.zeros(0)
@@ -195,30 +239,15 @@ def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
     )
 
 
-def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
+def _started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
     """The EpisodeStarted of an episode of arrays; without metadata the car counts as real."""
-    texts = episode.metadata
-    known = _started_texts(EpisodeStarted(0, 0.0, 0, "", Reality.REAL, "", "", 0, 0.0, 0))
-    known |= _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
-    written = {*known, RECOVERED, RECOVERY}  # a copy of a damaged recording is not damaged
-    period_s = float(texts.get("period_s", episode.period_s))
-    return EpisodeStarted(
-        episode=int(texts.get("episode", 1)),
-        t_s=float(texts.get("start_t_s", episode.times_s[0])),
-        wall_ns=int(texts.get("start_wall_ns", 0)),
-        car=texts.get("car", "unknown"),
-        reality=Reality(texts.get("reality", Reality.REAL.value)),
-        policy=texts.get("policy", "unknown"),
-        task=texts.get("task", "unknown"),
-        seed=int(texts.get("seed", 0)),
-        period_s=period_s,
-        history_length=int(texts.get("history_length", 0)),
-        goal=goal_of(texts),
-        arena_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "arena_m")),
-        path_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "path_m")),
-        config_toml=texts.get("config_toml", ""),
-        metadata={k: v for k, v in texts.items() if k not in written and not k.startswith(STATISTICS)},
-    )
+    texts, unknown = episode.metadata, "unknown"
+    start = (1, float(episode.times_s[0]), 0, unknown, Reality.REAL, unknown, unknown, 0, episode.period_s, 0)
+    defaults = facts_of(EpisodeStarted(*start))
+    ended = _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
+    written = {*defaults, "config_toml", *ended, RECOVERED, RECOVERY}  # a copy of a damaged recording is not damaged
+    metadata = {k: v for k, v in texts.items() if k not in written and not k.startswith(STATISTICS)}
+    return started_from_texts({**defaults, **texts}, texts.get("config_toml", ""), metadata)
 
 
 def _observations(episode: EpisodeData) -> Iterator[Observation]:

@@ -192,7 +192,7 @@ def run_episode(
     finally:
         _stop(safe, pacer, rows, hooks, reason, detail)
     origin = {"car": car.name, "reality": car.reality.value, "policy": policy.name, "task": task.name}
-    return rows.finish({**origin, "seed": str(seed), **(metadata or {}), **_end_texts(reason, detail)})
+    return rows.finish({**origin, "seed": str(seed), **(metadata or {}), **reason.texts(detail)})
 
 
 def _floats(points_m: Corners) -> Corners:
@@ -209,10 +209,6 @@ def _goal_of(task: Task) -> tuple[float, float, float] | None:
 
 def _outlines_text(task: Task) -> dict[str, str]:
     return {"outlines_m": json.dumps([_floats(line) for line in task.outlines_m])} if task.outlines_m else {}
-
-
-def _end_texts(reason: EndReason, detail: str) -> dict[str, str]:
-    return {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
 
 
 def _drive(

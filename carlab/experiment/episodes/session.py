@@ -221,8 +221,7 @@ def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:
 
 
 def _with_end(data: EpisodeData, reason: EndReason, detail: str) -> EpisodeData:
-    end = {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
-    return replace(data, metadata={**data.metadata, **end})
+    return replace(data, metadata={**data.metadata, **reason.texts(detail)})
 
 
 @contextlib.contextmanager

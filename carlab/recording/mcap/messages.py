@@ -16,8 +16,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
 from carlab.core.documents import EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
 from carlab.core.outcome import EndReason
-from carlab.core.quantities import Action, CarState, Health, Observation, PoseSample, Reality
-from carlab.recording.episode_builder import facts_of
+from carlab.core.quantities import Action, CarState, Health, Observation, PoseSample
+from carlab.recording.episode_builder import facts_of, is_number, json_value, started_from_texts
 from carlab.recording.mcap import schemas as schemas
 from carlab.recording.sink import Item, LogLine
 
@@ -160,9 +160,7 @@ def ended_to_metadata(ended: EpisodeEnded) -> dict[str, str]:
     """Everything of an EpisodeEnded except its last observation, which is a message."""
     return {
         "end_t_s": repr(ended.t_s),
-        "end_reason": ended.reason.name,
-        "end_sentence": ended.reason.value,
-        "end_detail": text(ended.detail),
+        **ended.reason.texts(text(ended.detail)),
         "steps": str(ended.steps),
         "total_reward": repr(ended.total_reward),
         "statistics": json.dumps(dict(ended.statistics)),
@@ -171,57 +169,15 @@ def ended_to_metadata(ended: EpisodeEnded) -> dict[str, str]:
 
 def started_from_metadata(record: Mapping[str, str], config_toml: str) -> EpisodeStarted:
     """The EpisodeStarted written by ``started_to_metadata``. Raises KeyError or ValueError for another record."""
-    goal = _json_value(record, "goal")
     prefix = "metadata."
-    return EpisodeStarted(
-        episode=int(record["episode"]),
-        t_s=float(record["start_t_s"]),
-        wall_ns=int(record["start_wall_ns"]),
-        car=record["car"],
-        reality=Reality(record["reality"]),
-        policy=record["policy"],
-        task=record["task"],
-        seed=int(record["seed"]),
-        period_s=float(record["period_s"]),
-        history_length=int(record["history_length"]),
-        goal=None if goal is None else _numbers(goal, 3),
-        arena_m=tuple(_numbers(point, 2) for point in _json_list(record, "arena_m")),
-        path_m=tuple(_numbers(point, 2) for point in _json_list(record, "path_m")),
-        config_toml=config_toml,
-        metadata={key.removeprefix(prefix): value for key, value in record.items() if key.startswith(prefix)},
-    )
-
-
-def _json_value(record: Mapping[str, str], key: str) -> Any:
-    """The JSON value under ``key``. Raises KeyError if it is missing, ValueError if it is invalid."""
-    try:
-        return json.loads(record[key])
-    except RecursionError as error:
-        raise ValueError(f"{key} is nested too deeply") from error
-
-
-def _json_list(record: Mapping[str, str], key: str) -> list[Any]:
-    value = _json_value(record, key)
-    if not isinstance(value, list):
-        raise ValueError(f"{key} is not a list")
-    return value
-
-
-def _numbers(value: Any, count: int) -> tuple[Any, ...]:
-    """``value`` as a tuple of ``count`` numbers; integers stay integers. Raises ValueError for other values."""
-    if not isinstance(value, list) or len(value) != count or not all(_is_number(number) for number in value):
-        raise ValueError(f"{count} numbers are expected")
-    return tuple(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    metadata = {key.removeprefix(prefix): value for key, value in record.items() if key.startswith(prefix)}
+    return started_from_texts(record, config_toml, metadata)
 
 
 def ended_from_metadata(record: Mapping[str, str], last: Observation | None) -> EpisodeEnded:
     """The EpisodeEnded written by ``ended_to_metadata``. Raises KeyError or ValueError for another record."""
-    statistics = _json_value(record, "statistics")
-    if not isinstance(statistics, dict) or not all(_is_number(value) for value in statistics.values()):
+    statistics = json_value(record, "statistics")
+    if not isinstance(statistics, dict) or not all(is_number(value) for value in statistics.values()):
         raise ValueError("statistics are not a mapping of names to numbers")
     return EpisodeEnded(
         t_s=float(record["end_t_s"]),
