@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,26 +68,14 @@ def rerun_file(
 
     from carlab.recording.pipe_file import PipeFile
 
-    partial = partial_path(path)
-    file = PipeFile(partial)
-    stream: rr.RecordingStream | None = None
-    try:
+    with replaced_file(path) as partial:
         partial.unlink(missing_ok=True)
-        file.open()
-        stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-        stream.save(file.start(), default_blueprint=blueprint)
-        yield stream
-        stream.disconnect()
-        stream = None
-        file.close()
-        file.check()
-        os.replace(partial, path)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
-    finally:
-        if stream is not None:
-            with suppress(Exception):
+        with closing(PipeFile(partial)) as file:
+            file.open()
+            stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+            try:
+                stream.save(file.start(), default_blueprint=blueprint)
+                yield stream
+            finally:
                 stream.disconnect()
-        file.close()
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+        file.check()
