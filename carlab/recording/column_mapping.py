@@ -249,9 +249,7 @@ def load_mapping(path: Path | str) -> ColumnMapping:
         )
         for channel, entry in columns.items()
     }
-    return from_table(ColumnMapping, {"columns": {}, **table}, str(path)).with_options(
-        columns={name: dataclasses.asdict(source) for name, source in sources.items()}
-    )
+    return dataclasses.replace(from_table(ColumnMapping, {"columns": {}, **table}, str(path)), columns=sources)
 
 
 CANONICAL = ColumnMapping({name: ColumnSource(name) for name in CHANNELS}, layout="canonical")

@@ -159,11 +159,6 @@ def yaw_quaternion(yaw_rad: FloatArray | float) -> FloatArray:
     return np.stack([zero, zero, np.sin(half_rad), np.cos(half_rad)], axis=-1)
 
 
-def closed(points_m: Sequence[tuple[float, float]]) -> list[tuple[float, float, float]]:
-    """Corners as a closed line on the ground."""
-    return [(x, y, 0.0) for x, y in (*points_m, points_m[0])]
-
-
 def log_surroundings(
     stream: rr.RecordingStream,
     arena_m: Sequence[tuple[float, float]],
@@ -173,7 +168,8 @@ def log_surroundings(
     """Log arena, reference path and goal of the plan view."""
     width = rr.Radius.ui_points(1.5)
     if arena_m:
-        line = rr.LineStrips3D([closed(arena_m)], radii=width, colors=look.VERMILION, labels="arena", show_labels=False)
+        border = [(x, y, 0.0) for x, y in (*arena_m, arena_m[0])]
+        line = rr.LineStrips3D([border], radii=width, colors=look.VERMILION, labels="arena", show_labels=False)
         stream.log(look.ARENA, line, static=True)
     if len(path_m) > 1:
         line = rr.LineStrips3D([[(x, y, 0.0) for x, y in path_m]], radii=width, colors=look.GREY)

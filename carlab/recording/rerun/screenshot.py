@@ -17,7 +17,8 @@ from carlab.recording.sink import writing
 
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
 _CANNOT = "The rerun viewer cannot draw here"
-_SETTLE_S = 5.0
+_SETTLE_S, _TIMEOUT_S = 5.0, 60.0
+"""Drawing on a processor takes about eight seconds."""
 _NO_DRIVER = (
     "no Vulkan driver is installed; install one that needs no graphics card with "
     "'apt-get install mesa-vulkan-drivers libvulkan1'"
@@ -34,16 +35,13 @@ def has_vulkan_driver() -> bool:
     return any(next(Path(folder).glob("*.json"), None) is not None for folder in _DRIVER_FOLDERS)
 
 
-def save_screenshot(
-    rrd_path: Path | str, png_path: Path | str, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0
-) -> None:
+def save_screenshot(rrd_path: Path | str, png_path: Path | str, *, size: tuple[int, int] = (1600, 1000)) -> None:
     """Open an .rrd in the headless viewer and save its picture once it no longer changes.
 
     Args:
         rrd_path: The recording.
         png_path: The picture; overwritten.
         size: Width and height of the picture in pixels.
-        timeout_s: Give up after this long [s]; drawing on a processor takes about eight seconds.
 
     Raises:
         DataError: The recording does not exist, or the picture cannot be written.
@@ -68,7 +66,7 @@ def save_screenshot(
             command, stdout=subprocess.DEVNULL, stderr=log, env=surroundings, start_new_session=True
         )
         try:
-            picture = _settled_picture(viewer, port, Path(folder), MonotonicClock().now_s() + timeout_s)
+            picture = _settled_picture(viewer, port, Path(folder), MonotonicClock().now_s() + _TIMEOUT_S)
         except (RuntimeError, OSError, ConnectionError) as error:
             log.seek(0)
             lines = [line.strip() for line in log if line.strip()]
