@@ -10,7 +10,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +78,13 @@ class CarState:
     def speed_mps(self) -> float:
         """Speed over ground [m/s]."""
         return math.hypot(self.vx_mps, self.vy_mps)
+
+    def after(self, time_s: float) -> CarState:
+        """The state after a time at constant body velocities, moved along the yaw of half the time."""
+        yaw = self.yaw_rad + 0.5 * time_s * self.yaw_rate_radps
+        x = self.x_m + time_s * (self.vx_mps * math.cos(yaw) - self.vy_mps * math.sin(yaw))
+        y = self.y_m + time_s * (self.vx_mps * math.sin(yaw) + self.vy_mps * math.cos(yaw))
+        return replace(self, x_m=x, y_m=y, yaw_rad=self.yaw_rad + time_s * self.yaw_rate_radps)
 
 
 @dataclass(frozen=True, slots=True)

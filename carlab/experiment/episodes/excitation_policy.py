@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,33 +15,28 @@ from carlab.core.safety import SafetyEnvelope
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects.base import GRAVITY_MPS2
 
-
-@dataclass(frozen=True, slots=True)
-class ExcitationSettings:
-    """How commands are drawn, and the distance that a predicted path keeps from the arena's edge."""
-
-    hold_s: tuple[float, float] = (0.2, 1.2)
-    """Range of the time [s] for which a command is constant: about the response times of steering and speed."""
-    throttle_shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
-    """Shares of commands with forward, no and backward throttle."""
-    min_throttle: float = 0.05
-    """Minimum throttle of a command that is not without throttle."""
-    draws: int = 64
-    """Number of commands that are drawn and predicted."""
-    margin_m: float = 0.2
-    """Distance [m] of a planned stopping point from the edge: errors of the pose and of the prediction."""
-    stopping_ratio: float = 1.5
-    """Planned stopping distance over that of the geofence. With this margin, the geofence ended none of 28 drives of a
-    minute in 3 by 3 m, with cars whose motor, grip, lag, delay or steering differ from the car file."""
-    choices: int = 4
-    """Number of drawn commands that keep the car inside, of which the one with the highest final speed is used. With 1
-    the car is slow, because most fast commands leave a small arena."""
-    reverse_weight: float = 0.5
-    """Weight of a speed in reverse."""
-    step_s: float = 0.05
-    """Step [s] of the prediction."""
-    stopping_s: float = 0.2
-    """Time [s] in which a slow car brakes to rest; a fast one brakes with the deceleration of the geofence."""
+HOLD_S = (0.2, 1.2)
+"""Range of the time for which a command is constant: about the response times of steering and speed."""
+THROTTLE_SHARES = (0.6, 0.2, 0.2)
+"""Shares of commands with forward, no and backward throttle."""
+MIN_THROTTLE = 0.05
+"""Minimum throttle of a command that is not without throttle."""
+N_DRAWS = 64
+"""Number of commands that are drawn and predicted."""
+MARGIN_M = 0.2
+"""Distance of a planned stopping point from the edge: errors of the pose and of the prediction."""
+STOPPING_RATIO = 1.5
+"""Planned stopping distance over that of the geofence. With this margin, the geofence ended none of 28 drives of a
+minute in 3 by 3 m, with cars whose motor, grip, lag, delay or steering differ from the car file."""
+N_CHOICES = 4
+"""Number of drawn commands that keep the car inside, of which the one with the highest final speed is used. With 1
+the car is slow, because most fast commands leave a small arena."""
+REVERSE_WEIGHT = 0.5
+"""Weight of a speed in reverse."""
+STEP_S = 0.05
+"""Step of the prediction."""
+STOPPING_S = 0.2
+"""Time in which a slow car brakes to rest; a fast one brakes with the deceleration of the geofence."""
 
 
 class ExcitationPolicy:
@@ -70,7 +64,6 @@ class ExcitationPolicy:
         self._car = simulator.parameters
         self._delay_s = simulator.command_delay_s
         self._envelope = envelope
-        self._settings = ExcitationSettings()
         self._rng = np.random.default_rng(seed)
         self._action = NEUTRAL
         self._until_s = 0.0
@@ -81,17 +74,17 @@ class ExcitationPolicy:
 
     def act(self, view: PolicyInput) -> Action | None:
         """The command that is held, a new one, or braking."""
-        state = self._when_command_acts(view.observation.state)
+        state = view.observation.state.after(self._delay_s)
         left_s = self._until_s - view.elapsed_s
         if left_s > 0.0 and self._planned(state, self._action.to_array()[None], np.array([left_s]))[0][0]:
             return self._action
         commands, hold_s = self._draw()
         stays_inside, speed = self._planned(state, commands, hold_s)
-        inside = np.flatnonzero(stays_inside)[: self._settings.choices]
+        inside = np.flatnonzero(stays_inside)[:N_CHOICES]
         if not len(inside):
             self._until_s = -math.inf
             return self._braking(state)
-        preference = np.where(speed < 0.0, -self._settings.reverse_weight * speed, speed)
+        preference = np.where(speed < 0.0, -REVERSE_WEIGHT * speed, speed)
         chosen = inside[int(np.argmax(preference[inside]))]
         self._action = Action.from_array(commands[chosen])
         self._until_s = view.elapsed_s + float(hold_s[chosen])
@@ -99,27 +92,24 @@ class ExcitationPolicy:
 
     def _draw(self) -> tuple[FloatArray, FloatArray]:
         """Commands (n, 2) and the times (n,) for which they are held [s]."""
-        settings, envelope, rng = self._settings, self._envelope, self._rng
-        count = settings.draws
-        sign = rng.choice([1.0, 0.0, -1.0], count, p=settings.throttle_shares)
-        size = rng.uniform(min(settings.min_throttle, envelope.max_throttle), envelope.max_throttle, count)
-        steering = rng.uniform(-envelope.max_steering, envelope.max_steering, count)
-        return np.stack([steering, sign * size], axis=1), rng.uniform(*settings.hold_s, count)
+        envelope, rng = self._envelope, self._rng
+        sign = rng.choice([1.0, 0.0, -1.0], N_DRAWS, p=THROTTLE_SHARES)
+        size = rng.uniform(min(MIN_THROTTLE, envelope.max_throttle), envelope.max_throttle, N_DRAWS)
+        steering = rng.uniform(-envelope.max_steering, envelope.max_steering, N_DRAWS)
+        return np.stack([steering, sign * size], axis=1), rng.uniform(*HOLD_S, N_DRAWS)
 
     def _planned(
         self, state: CarState, commands: FloatArray, hold_s: FloatArray
     ) -> tuple[NDArray[np.bool_], FloatArray]:
         """Whether the car can stop inside the arena at each moment of each command (n,), and its final speed [m/s]."""
-        settings, envelope = self._settings, self._envelope
-        steps = max(math.ceil(float(hold_s.max()) / settings.step_s), 1)
+        envelope = self._envelope
+        steps = max(math.ceil(float(hold_s.max()) / STEP_S), 1)
         place, course, speed = self._predicted(state, commands, steps)
-        needed = stopping_distance_m(
-            settings.stopping_ratio * np.abs(speed), envelope.reaction_s, envelope.deceleration_mps2
-        )
+        needed = stopping_distance_m(STOPPING_RATIO * np.abs(speed), envelope.reaction_s, envelope.deceleration_mps2)
         stops = can_stop_inside_batch(
-            envelope.arena_m, place.reshape(-1, 2), course.ravel(), needed.ravel() + settings.margin_m
+            envelope.arena_m, place.reshape(-1, 2), course.ravel(), needed.ravel() + MARGIN_M
         ).reshape(course.shape)
-        is_later = settings.step_s * np.arange(steps)[:, None] >= hold_s
+        is_later = STEP_S * np.arange(steps)[:, None] >= hold_s
         last = (~is_later).sum(axis=0) - 1
         return np.asarray((stops | is_later).all(axis=0)), speed[last, np.arange(len(hold_s))]
 
@@ -127,7 +117,7 @@ class ExcitationPolicy:
         self, state: CarState, commands: FloatArray, steps: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Places (steps, n, 2) [m], courses [rad] and speeds [m/s] (steps, n); speeds are negative in reverse."""
-        car, dt = self._car, self._settings.step_s
+        car, dt = self._car, STEP_S
         curvature = np.tan(commands[:, 0] * car.max_angle_rad) / car.wheelbase_m
         grip_mps2 = GRAVITY_MPS2 * min(car.front_mu, car.rear_mu)
         yaw = np.full(len(commands), state.yaw_rad)
@@ -143,24 +133,9 @@ class ExcitationPolicy:
         places, courses, speeds = (np.array(each) for each in zip(*found, strict=True))
         return places, courses, speeds
 
-    def _when_command_acts(self, state: CarState) -> CarState:
-        """The state after the command delay at constant velocities."""
-        yaw = state.yaw_rad + 0.5 * self._delay_s * state.yaw_rate_radps
-        vx, vy = state.vx_mps, state.vy_mps
-        return CarState(
-            state.x_m + self._delay_s * (vx * math.cos(yaw) - vy * math.sin(yaw)),
-            state.y_m + self._delay_s * (vx * math.sin(yaw) + vy * math.cos(yaw)),
-            state.yaw_rad + self._delay_s * state.yaw_rate_radps,
-            vx,
-            vy,
-            state.yaw_rate_radps,
-        )
-
     def _braking(self, state: CarState) -> Action:
         """Straight ahead, with the throttle that stops the car at the geofence's deceleration."""
         car, envelope = self._car, self._envelope
-        stop_mps2 = float(
-            np.clip(state.vx_mps / self._settings.stopping_s, -envelope.deceleration_mps2, envelope.deceleration_mps2)
-        )
+        stop_mps2 = float(np.clip(state.vx_mps / STOPPING_S, -envelope.deceleration_mps2, envelope.deceleration_mps2))
         throttle = -car.mass_kg * stop_mps2 / max(car.drive_gain_n, 1e-6)
         return Action(0.0, min(max(throttle, -envelope.max_throttle), envelope.max_throttle))

@@ -102,19 +102,15 @@ class ReverseParkingPolicy(StatelessPolicy):
 
     def act(self, view: PolicyInput) -> Action | None:
         """Steering and throttle of this tick."""
-        state = view.observation.state
-        yaw = state.yaw_rad + state.yaw_rate_radps * self.reaction_s
-        mid_yaw = state.yaw_rad + 0.5 * state.yaw_rate_radps * self.reaction_s
-        x = state.x_m + self.reaction_s * (state.vx_mps * math.cos(mid_yaw) - state.vy_mps * math.sin(mid_yaw))
-        y = state.y_m + self.reaction_s * (state.vx_mps * math.sin(mid_yaw) + state.vy_mps * math.cos(mid_yaw))
+        state = view.observation.state.after(self.reaction_s)
         # Distances along the line, in reverse direction of the goal's heading, and to its left.
         line = self.goal[2] + math.pi
-        dx, dy = self.goal[0] - x, self.goal[1] - y
+        dx, dy = self.goal[0] - state.x_m, self.goal[1] - state.y_m
         ahead = dx * math.cos(line) + dy * math.sin(line)
         left = dx * math.sin(line) - dy * math.cos(line)
         desired_course = -self.approach_rad * (2.0 / math.pi) * math.atan(left / self.line_width_m)
         # The yaw rate persists because of tyre lag; the course is predicted over ``swing_s``.
-        course = wrap(yaw + self.swing_s * state.yaw_rate_radps + math.pi - line)
+        course = wrap(state.yaw_rad + self.swing_s * state.yaw_rate_radps + math.pi - line)
         course_error = wrap(desired_course - course)
         limit = math.tan(self.max_angle_rad) / self.wheelbase_m
         curvature = min(max(self.turn_gain_per_m * course_error, -limit), limit)
