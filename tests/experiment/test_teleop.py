@@ -8,7 +8,6 @@ from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import CarState, Observation
 from carlab.experiment.episodes.teleop_policy import (
-    GamepadMapping,
     GamepadSource,
     KeyboardSource,
     TeleopInput,
@@ -83,20 +82,19 @@ def test_finish_input_ends_the_policy() -> None:
 
 
 def test_gamepad_axes_follow_the_sign_conventions() -> None:
-    mapping = GamepadMapping()
     buttons = [False] * 12
-    assert gamepad_input(AXES_AT_REST, buttons, mapping) == TeleopInput()
-    left = gamepad_input([-1.0, *AXES_AT_REST[1:]], buttons, mapping)
+    assert gamepad_input(AXES_AT_REST, buttons) == TeleopInput()
+    left = gamepad_input([-1.0, *AXES_AT_REST[1:]], buttons)
     assert left.steering == pytest.approx(1.0)  # Stick to the left steers left, which is positive.
-    forward = gamepad_input([*AXES_AT_REST[:5], 1.0], buttons, mapping)
+    forward = gamepad_input([*AXES_AT_REST[:5], 1.0], buttons)
     assert forward.throttle == pytest.approx(1.0)
-    both = gamepad_input([0.0, 0.0, 1.0, 0.0, 0.0, 1.0], buttons, mapping)
+    both = gamepad_input([0.0, 0.0, 1.0, 0.0, 0.0, 1.0], buttons)
     assert both.throttle == 0.0
-    drift = gamepad_input([0.07, *AXES_AT_REST[1:]], buttons, mapping)
+    drift = gamepad_input([0.07, *AXES_AT_REST[1:]], buttons)
     assert drift.steering == 0.0
-    held = gamepad_input(AXES_AT_REST, [*[False] * 4, True], mapping)
+    held = gamepad_input(AXES_AT_REST, [*[False] * 4, True])
     assert held.deadman
-    assert gamepad_input([], [], mapping) == TeleopInput()
+    assert gamepad_input([], []) == TeleopInput()
 
 
 def test_missing_gamepad_is_reported() -> None:

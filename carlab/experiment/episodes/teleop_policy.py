@@ -43,20 +43,13 @@ class InputSource(Protocol):
         """Release the device. Idempotent."""
 
 
-@dataclass(frozen=True, slots=True)
-class GamepadMapping:
-    """SDL numbers of axes and buttons of common gamepads; triggers read -1 when released and +1 when pressed."""
-
-    steering_axis: int = 0
-    forward_axis: int = 5
-    reverse_axis: int = 2
-    deadman_button: int = 4
-    emergency_button: int = 1
-    finish_button: int = 7
-    dead_zone: float = 0.08
+# SDL numbers of axes and buttons of common gamepads; triggers read -1 when released and +1 when pressed.
+STEERING_AXIS, FORWARD_AXIS, REVERSE_AXIS = 0, 5, 2
+DEADMAN_BUTTON, EMERGENCY_BUTTON, FINISH_BUTTON = 4, 1, 7
+DEAD_ZONE = 0.08
 
 
-def gamepad_input(axes: list[float], buttons: list[bool], mapping: GamepadMapping) -> TeleopInput:
+def gamepad_input(axes: list[float], buttons: list[bool]) -> TeleopInput:
     """Convert raw axes in [-1, 1] and buttons; a missing axis or button counts as released."""
 
     def axis(index: int, rest: float) -> float:
@@ -66,17 +59,17 @@ def gamepad_input(axes: list[float], buttons: list[bool], mapping: GamepadMappin
         return index < len(buttons) and buttons[index]
 
     def without_dead_zone(value: float) -> float:
-        size = max(abs(value) - mapping.dead_zone, 0.0) / (1.0 - mapping.dead_zone)
+        size = max(abs(value) - DEAD_ZONE, 0.0) / (1.0 - DEAD_ZONE)
         return size if value > 0 else -size
 
-    forward = 0.5 * (axis(mapping.forward_axis, -1.0) + 1.0)
-    reverse = 0.5 * (axis(mapping.reverse_axis, -1.0) + 1.0)
+    forward = 0.5 * (axis(FORWARD_AXIS, -1.0) + 1.0)
+    reverse = 0.5 * (axis(REVERSE_AXIS, -1.0) + 1.0)
     return TeleopInput(
-        steering=-without_dead_zone(axis(mapping.steering_axis, 0.0)),
+        steering=-without_dead_zone(axis(STEERING_AXIS, 0.0)),
         throttle=without_dead_zone(forward - reverse),
-        deadman=button(mapping.deadman_button),
-        emergency_stop=button(mapping.emergency_button),
-        finish=button(mapping.finish_button),
+        deadman=button(DEADMAN_BUTTON),
+        emergency_stop=button(EMERGENCY_BUTTON),
+        finish=button(FINISH_BUTTON),
     )
 
 
@@ -95,7 +88,6 @@ class GamepadSource:
     """Gamepad number ``index``, by default the first."""
 
     index: int = 0
-    mapping: GamepadMapping = field(default_factory=GamepadMapping)
     name: str = "gamepad"
     _pygame: Any = None
     _stick: Any = None
@@ -126,13 +118,13 @@ class GamepadSource:
                 return TeleopInput(present=False)
             if event.type == self._pygame.JOYAXISMOTION:
                 self._touched.add(event.axis)
-        triggers = (self.mapping.forward_axis, self.mapping.reverse_axis)
+        triggers = (FORWARD_AXIS, REVERSE_AXIS)
         axes = [
             -1.0 if i in triggers and i not in self._touched else float(self._stick.get_axis(i))
             for i in range(self._stick.get_numaxes())
         ]
         buttons = [bool(self._stick.get_button(i)) for i in range(self._stick.get_numbuttons())]
-        return gamepad_input(axes, buttons, self.mapping)
+        return gamepad_input(axes, buttons)
 
     def close(self) -> None:
         """Release the gamepad. Idempotent."""
