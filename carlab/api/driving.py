@@ -293,7 +293,7 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
 
     with learning_run(folder.parent.parent if folder.parent.name == "models" else folder):
         learned = load_policy(folder)
-    period_s, own = learned.control_period_s, learned.plan.task_choice
+    period_s, own = learned.plan.control_period_s, learned.plan.task_choice
     if abs(period_s - choice.control_period_s) > PERIOD_TOLERANCE * period_s:
         raise ConfigError(
             f"The policy in {folder} was trained with a control period of {period_s:.4g} s, the car has "

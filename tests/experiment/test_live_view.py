@@ -19,7 +19,7 @@ from carlab.core.documents import EpisodeStarted, Tick
 from carlab.core.errors import ConfigError, NotReadyError
 from carlab.experiment.campaign import live_view
 from carlab.experiment.campaign.figures import predict_ahead
-from carlab.experiment.campaign.live_view import Activity, LiveSettings, LiveView, show
+from carlab.experiment.campaign.live_view import LiveSettings, LiveView, show
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.rerun.viewer import check_viewer
 from learning.rollouts import StatelessModel
@@ -34,8 +34,8 @@ def save_to(stream: Any, path: Path) -> None:
 def test_view_shows_all_episodes_that_were_emitted(tmp_path: Path) -> None:
     run = drive(tmp_path, TICKS, episodes=2)
     messages: queue.Queue[Any] = queue.Queue()
-    messages.put(Activity("learning the car", 0, 10))
-    messages.put(Activity("learning the car", 1, 10))
+    messages.put("learning the car")
+    messages.put("learning the car")
     documents = [read_documents(path) for path in run.recordings()]
     messages.put(documents[0][5])  # Its start was lost: it is omitted.
     for document in (*documents[0], *documents[1], None):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
+from carlab.core.json_files import plain
 from carlab.core.observation import decode_state
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import FloatArray
@@ -95,8 +95,8 @@ class EpisodeFigures:
 
     def to_dict(self) -> dict[str, Any]:
         """Values for a JSON file; NaN becomes null."""
-        row = asdict(self)
-        return _with_null({**row, "task_figures": _with_null(row["task_figures"])})
+        row: dict[str, Any] = plain(asdict(self))
+        return row
 
     def with_check(self, check: EpisodeCheck) -> EpisodeFigures:
         """Copy with the result of a quick check."""
@@ -121,10 +121,6 @@ class EpisodeFigures:
         return is_near and self.end in _REGULAR_ENDS
 
 
-def _with_null(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
-
-
 def _with_nan(row: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(row, Mapping):
         raise TypeError(f"{row!r} is not an object")
@@ -143,6 +139,10 @@ def figures_of(result: EpisodeResult, training: Mapping[str, Any], task: Task) -
         ConfigError: the task cannot state the outcome.
     """
     summary = {**dict.fromkeys(_SUMMARY_FIELDS, float("nan")), **result.summary}
+
+    def optional(name: str) -> float:
+        return float(training.get(name, "nan"))
+
     return EpisodeFigures(
         episode=int(training["episode"]),
         total_reward=result.total_reward,
@@ -152,19 +152,19 @@ def figures_of(result: EpisodeResult, training: Mapping[str, Any], task: Task) -
         yaw_error_rad=summary["yaw_error_rad"],
         speed_mps=summary["speed_mps"],
         rows=int(training["rows"]),
-        last_episode_nll=float(training.get("last_episode_nll", float("nan"))),
-        last_episode_calibration_error=float(training.get("last_episode_calibration_error", float("nan"))),
+        last_episode_nll=optional("last_episode_nll"),
+        last_episode_calibration_error=optional("last_episode_calibration_error"),
         model_seconds=float(training["model_seconds"]),
         policy_seconds=float(training["policy_seconds"]),
         updates=int(training["updates"]),
         end=result.reason.name,
-        predicted_low=float(training.get("predicted_low", float("nan"))),
-        predicted_high=float(training.get("predicted_high", float("nan"))),
+        predicted_low=optional("predicted_low"),
+        predicted_high=optional("predicted_high"),
         prior_change=str(training.get("prior_change", "")),
         outcome=_outcome(task, summary, result.path),
         cost=summary["cost"],
         violations=summary["violations"],
-        predicted_cost=float(training.get("cost_in_model", float("nan"))),
+        predicted_cost=optional("cost_in_model"),
         task_figures={k: float(v) for k, v in summary.items() if k not in (*_SUMMARY_FIELDS, "success")},
     )
 

@@ -28,11 +28,6 @@ class LearnedPolicy:
     plan: TrainingPlan
     history: int
 
-    @property
-    def control_period_s(self) -> float:
-        """Control period of the training [s]."""
-        return self.plan.control_period_s
-
 
 def load_policy(folder: Path) -> LearnedPolicy:
     """Read the newest policy of a run, or that of an episode (``RUN/models/0003``).

@@ -42,15 +42,6 @@ NICENESS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Activity:
-    """What a run does between two drives; ``done`` of ``total`` steps."""
-
-    name: str
-    done: int
-    total: int
-
-
-@dataclass(frozen=True, slots=True)
 class LiveSettings:
     """What the process of the view needs.
 
@@ -87,9 +78,9 @@ class LiveView:
             self.dropped += 1
 
     def report_activity(self, name: str, done: int, total: int) -> None:
-        """Pass the progress of the work between two drives."""
+        """Pass the name of the work between two drives; a view does not show its progress."""
         with contextlib.suppress(queue.Full, ValueError):
-            self._queue.put_nowait(Activity(name, done, total))
+            self._queue.put_nowait(name)
 
     def __enter__(self) -> Self:
         with interrupts_blocked():  # The process of the run handles ^C.
@@ -172,13 +163,13 @@ class _LiveWriter:
         self._row: EpisodeFigures | None = None
         self._activity = ""
 
-    def write(self, message: Document | EpisodeFigures | EpisodeCheck | Activity) -> None:
-        """Write a document, figures, a quick check or an activity."""
+    def write(self, message: Document | EpisodeFigures | EpisodeCheck | str) -> None:
+        """Write a document, figures, a quick check or the name of an activity."""
         match message:
-            case Activity():
-                if message.name != self._activity:
-                    self._activity = message.name
-                    self._recording.documents.text(LOG, message.name)
+            case str():
+                if message != self._activity:
+                    self._activity = message
+                    self._recording.documents.text(LOG, message)
             case EpisodeFigures():
                 self._write_figures(message)
             case EpisodeCheck():

@@ -23,26 +23,23 @@ CHARACTERS_PER_LINE = 210
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A panel of the learning curve: names of figures with label and colour."""
+    """A panel of the learning curve: label and colour of each figure by its name."""
 
     title: str
-    series: Mapping[str, str]
-    colors: Mapping[str, str]
+    series: Mapping[str, tuple[str, str]]
     marks_success: bool = False
 
 
 CURVES = (
     Curve(
         "Return",
-        {"total_reward": "on the car", "predicted_return": "predicted"},
-        {"total_reward": "tab:blue", "predicted_return": "tab:orange"},
+        {"total_reward": ("on the car", "tab:blue"), "predicted_return": ("predicted", "tab:orange")},
         marks_success=True,
     ),
-    Curve("Distance from the goal at the end [m]", {"distance_m": "distance"}, {"distance_m": "tab:gray"}),
+    Curve("Distance from the goal at the end [m]", {"distance_m": ("distance", "tab:gray")}),
     Curve(
         "Negative log-likelihood of the\nprevious episode [nat per step]",
-        {"last_episode_nll": "nll"},
-        {"last_episode_nll": "tab:purple"},
+        {"last_episode_nll": ("nll", "tab:purple")},
     ),
 )
 
@@ -72,7 +69,7 @@ def draw(
     if rows[-1].verdict:
         figure.suptitle(textwrap.fill(rows[-1].diagnosis, CHARACTERS_PER_LINE), fontsize=9, x=0.01, ha="left")
     upper, lower = figure.subfigures(2, 1, height_ratios=(3, 2))
-    curves = [curve for curve in CURVES if _has_data(rows, curve)]
+    curves = [c for c in CURVES if any(np.isfinite(getattr(row, name)) for row in rows for name in c.series)]
     axes = upper.subplots(1, len(curves) + 1, width_ratios=[*([2] * len(curves)), 3], squeeze=False)[0]
     for axis, curve in zip(axes, curves, strict=False):
         _curve(axis, rows, curve)
@@ -84,19 +81,15 @@ def draw(
     figure.savefig(path, dpi=120)
 
 
-def _has_data(rows: Sequence[EpisodeFigures], curve: Curve) -> bool:
-    return any(np.isfinite(getattr(row, name)) for row in rows for name in curve.series)
-
-
 def _curve(axis: Any, rows: Sequence[EpisodeFigures], curve: Curve) -> None:
     """Plot figures over the episodes; stars mark successful ones."""
     from matplotlib.ticker import MaxNLocator
 
     numbers = [row.episode for row in rows]
     first = next(iter(curve.series))
-    for name, label in curve.series.items():
+    for name, (label, color) in curve.series.items():
         style = {"marker": "o"} if name == first else {"marker": ".", "linestyle": "--"}
-        axis.plot(numbers, [getattr(row, name) for row in rows], color=curve.colors[name], label=label, **style)
+        axis.plot(numbers, [getattr(row, name) for row in rows], color=color, label=label, **style)
     successful = [row for row in rows if row.success]
     if successful and curve.marks_success:
         values = [getattr(row, first) for row in successful]

@@ -7,8 +7,9 @@ part of the result; the run continues.
 from __future__ import annotations
 
 import logging
+import math
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,15 +43,6 @@ class EpisodeCheck:
     sentences: tuple[str, ...]
     short: str
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> EpisodeCheck:
-        """Read the content of a file. Raises KeyError, TypeError or ValueError for other content."""
-        excess, excess_std = (
-            float("nan") if content[k] is None else float(content[k]) for k in ("excess", "score_std")
-        )
-        lines = tuple(str(s) for s in content["sentences"])
-        return cls(int(content["episode"]), str(content["verdict"]), excess, excess_std, lines, str(content["short"]))
-
 
 def check_path(run: RunDirectory, episode: int) -> Path:
     """File of the check of an episode."""
@@ -77,7 +69,14 @@ def run_check_subprocess(
         else:
             log.warning("The quick check of episode %d failed: %s", number, error)
             result = _failed(f"its process failed ({error})")
-    return None if result is None else EpisodeCheck.from_dict(_saved(path, number, result))
+    if result is None:
+        return None
+    try:
+        write_json(path, {"episode": number, **result})
+    except DataError as error:
+        log.warning("The quick check is not stored: %s", error)
+    excess, std = (math.nan if result[name] is None else result[name] for name in ("excess", "score_std"))
+    return EpisodeCheck(number, result["verdict"], excess, std, tuple(result["sentences"]), result["short"])
 
 
 def check(run: Path, recordings: list[Path], simulator_toml: str) -> dict[str, Any]:
@@ -111,13 +110,3 @@ def next_step(run: Path) -> str:
 def _failed(reason: str) -> dict[str, Any]:
     text = f"The quick check of this episode failed ({reason.rstrip('.')}); learning continues."
     return {"verdict": "failed", "why": reason, "excess": None, "score_std": None, "sentences": [text], "short": ""}
-
-
-def _saved(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
-    """Write the content of the file; returns it."""
-    content = {"episode": episode, **result}
-    try:
-        write_json(path, content)
-    except DataError as error:
-        log.warning("The quick check is not stored: %s", error)
-    return content

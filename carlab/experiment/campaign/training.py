@@ -150,7 +150,9 @@ def train(request: TrainingRequest, progress: Progress) -> dict[str, Any]:
     clock = MonotonicClock()
     began_s = clock.now_s()
     if number - 1 == EPISODES_BEFORE_HISTORY_CHOICE:
-        figures |= _history_figures(usable, progress)
+        progress("choosing the number of past commands", 0, 1)
+        if (choice := find_history(usable)) is not None:
+            figures |= {"supported_history": choice.history, "history_message": choice.message()}
     seed = plan.seed + 1000 * number
     same_inputs = earlier_car if earlier_car is not None and earlier_car.history == plan.history else None
     dynamics = _fitted(plan, _prior_model(plan, usable), usable, rows, same_inputs, seed, progress)
@@ -185,13 +187,6 @@ def _prior_model(plan: TrainingPlan, episodes: list[EpisodeData]) -> CarModel:
     """The prior simulator with the velocity delay of the recordings."""
     simulator = SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
     return CarModel(simulator, plan.history, known_ranges(simulator), velocity_delay_s=velocity_delay_s(episodes))
-
-
-def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[str, Any]:
-    """The number of past commands that the recordings support, and its message; empty if the data are too few."""
-    progress("choosing the number of past commands", 0, 1)
-    choice = find_history(episodes)
-    return {} if choice is None else {"supported_history": choice.history, "history_message": choice.message()}
 
 
 def _environments(
