@@ -153,6 +153,11 @@ class BenchOptions:
     verbose: bool = False
     """Show the whole log."""
 
+    @property
+    def all_seeds(self) -> range:
+        """Seeds of all repetitions."""
+        return range(self.first_seed, self.first_seed + self.seeds)
+
 
 SPEED, REGRESSION, PRIORS = "'bench speed'", "'bench regression'", "'bench priors'"
 PARKING, ROLLOUTS, REALCARS = "'bench parking'", "'bench rollouts'", "'bench realcars'"

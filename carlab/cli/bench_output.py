@@ -11,9 +11,12 @@ from carlab.cli.bench_jobs import StudyJob, read_figures
 from carlab.cli.bench_options import BenchOptions
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
+from carlab.cli.recordings import load_episodes
+from carlab.core.episode_data import EpisodeData
 from carlab.jobs.child_jobs import ChildJob
 from carlab.recording.atomic_files import write_json
 from carlab.studies.regression.picture import draw
+from carlab.studies.regression.recordings import RecordedCase, recorded_case
 from carlab.studies.regression.scores import Row, Score, as_json, failed_score, scores_from_json, summarised
 from learning.devices import device_name
 
@@ -21,6 +24,16 @@ from learning.devices import device_name
 def command() -> str:
     """The current command line, quoted for a shell."""
     return shlex.join(["carlab", *sys.argv[1:]])
+
+
+def load_case(
+    files: Sequence[Path], car: Path, history: int | None
+) -> tuple[RecordedCase, list[Sequence[EpisodeData]]]:
+    """The case of recordings (the last one is held out) and their episodes; prints the number of past commands."""
+    recordings = [load_episodes(path) for path in files]
+    case = recorded_case(recordings, car, history)
+    console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
+    return case, recordings
 
 
 def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[str]) -> StudyJob[Score]:

@@ -170,7 +170,7 @@ def _curves(runs: Sequence[_Run], options: BenchOptions) -> list[Curve]:
 
 def _runs(options: BenchOptions) -> list[_Run]:
     """All runs of the study, seed by seed."""
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    seeds = options.all_seeds
     if options.realities is not None:
         if not 0 < options.realities <= len(REALITIES):
             raise ConfigError(f"--realities {options.realities}: give a number from 1 to {len(REALITIES)}.")

@@ -14,14 +14,14 @@ from carlab.api.recordings import required_file
 from carlab.cars import load_car_file
 from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, run_study_parts
 from carlab.cli.bench_options import BenchOptions, row_counts
-from carlab.cli.bench_output import report, score_job, write_scores
+from carlab.cli.bench_output import load_case, report, score_job, write_scores
 from carlab.cli.console import console, progress
 from carlab.cli.diagnose import Diagnose
-from carlab.cli.recordings import load_episodes
+from carlab.cli.recordings import recordings_in
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
 from carlab.studies.priors import checked_counts, prior_models, run_prior_study
-from carlab.studies.regression.recordings import RecordedCase, recorded_case
+from carlab.studies.regression.recordings import RecordedCase
 from carlab.studies.regression.scores import Score
 
 MODEL = "model.toml"
@@ -43,8 +43,7 @@ def run_priors(options: BenchOptions) -> int:
             check_held_out(model, files[-1])
         diagnosed = load_car_file(model).simulator
         simulator = load_car_file(car).simulator
-        case = recorded_case([load_episodes(path) for path in files], car, options.history)
-        console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
+        case, _ = load_case(files, car, options.history)
         priors = prior_models(case, simulator, diagnosed)
         scores, stopped = run_study_parts(
             lambda progress, stop: run_prior_study(
@@ -66,8 +65,7 @@ def _jobs(
     recorded, contents = recorded_files(files, car, case.rows.history)
     contents[MODEL] = model.read_bytes()
     jobs = []
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
-    for rows, seed in itertools.product(checked_counts(case, row_counts(options)), seeds):
+    for rows, seed in itertools.product(checked_counts(case, row_counts(options)), options.all_seeds):
         job = bench_job(options, rows, seed, [*recorded, "--diagnosed", MODEL], contents)
         jobs.append(score_job(job, case.name, rows, seed, priors))
     return jobs
@@ -93,16 +91,6 @@ def check_held_out(model: Path, held_out: Path) -> None:
             f"{model} was diagnosed with {held_out.name}, which is held out here; diagnose without it, or remove "
             "--diagnosed."
         )
-
-
-def recordings_in(folder: Path, min_count: int = 2) -> list[Path]:
-    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for fewer than ``min_count``."""
-    if not folder.is_dir():
-        raise ConfigError(f"--data {folder} is not a folder; name a folder with recordings (MCAP or CSV).")
-    files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
-    if len(files) < min_count:
-        raise DataError(f"{folder} has {len(files)} recordings; add some (at least {min_count}).")
-    return files
 
 
 def _recordings(options: BenchOptions, work: Path) -> tuple[Path, list[Path], str]:

@@ -7,9 +7,9 @@ from pathlib import Path
 from carlab.api.diagnosis import diagnose
 from carlab.cli.bench_options import BenchOptions
 from carlab.cli.bench_output import command
-from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
+from carlab.cli.recordings import recordings_in
 from carlab.cli.runs import search_callbacks
 from carlab.core.errors import ConfigError
 from carlab.diagnosis.report.events import diagnosed_event_sentences

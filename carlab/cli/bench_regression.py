@@ -7,20 +7,20 @@ from pathlib import Path
 
 from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, run_study_parts
 from carlab.cli.bench_options import BenchOptions, row_counts
-from carlab.cli.bench_output import report, score_job, write_scores
-from carlab.cli.bench_priors import recordings_in
-from carlab.cli.console import console
-from carlab.cli.recordings import load_episodes
+from carlab.cli.bench_output import load_case, report, score_job, write_scores
+from carlab.cli.recordings import recordings_in
 from carlab.core.errors import ConfigError
 from carlab.studies.regression.cases import CASES
-from carlab.studies.regression.recordings import RecordedCase, recorded_case
+from carlab.studies.regression.recordings import RecordedCase
 from carlab.studies.regression.scores import Score
 from carlab.studies.regression.study import plan_study, run_study
 
 
 def run_regression(options: BenchOptions) -> int:
     """Fit every method to few rows, and print; the figures are written after each fit."""
-    case = _recorded(options) if options.case == "realcar" else options.case
+    case: str | RecordedCase = options.case
+    if options.case == "realcar":
+        case, _ = load_case(_recordings(options), options.car, options.history)
     scores, stopped = run_study_parts(
         lambda progress, stop: run_study(
             case, rows=row_counts(options), seeds=options.seeds, first_seed=options.first_seed, methods=options.methods,
@@ -38,11 +38,10 @@ def run_regression(options: BenchOptions) -> int:
 
 def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Score]]:
     """One job for each fit."""
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
     plan = plan_study(
         case,
         rows=row_counts(options),
-        seeds=seeds,
+        seeds=options.all_seeds,
         methods=options.methods,
         structure=options.structure,
         data=options.data,
@@ -63,13 +62,6 @@ def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Scor
         job = bench_job(options, fit.rows, fit.seed, [*given, "--methods", fit.method], more)
         jobs.append(score_job(job, options.case, fit.rows, fit.seed, [fit.method]))
     return jobs
-
-
-def _recorded(options: BenchOptions) -> RecordedCase:
-    files = _recordings(options)
-    case = recorded_case([load_episodes(path) for path in files], options.car, options.history)
-    console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
-    return case
 
 
 def _recordings(options: BenchOptions) -> list[Path]:

@@ -9,15 +9,14 @@ from pathlib import Path
 from carlab.cars import load_car_file
 from carlab.cli.bench_jobs import StudyJob, bench_job, read_figures, recorded_files, reporting_job, run_study_parts
 from carlab.cli.bench_options import BenchOptions
-from carlab.cli.bench_output import command
-from carlab.cli.bench_priors import recordings_in
+from carlab.cli.bench_output import command, load_case
 from carlab.cli.console import console, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
-from carlab.cli.recordings import load_episodes
+from carlab.cli.recordings import recordings_in
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.recording.atomic_files import write_json
-from carlab.studies.regression.recordings import RecordedCase, recorded_case
+from carlab.studies.regression.recordings import RecordedCase
 from carlab.studies.rollouts import RolloutScore, Rows, as_json, checked_counts, run_rollout_study, scores_from_json
 
 Recordings = Sequence[Sequence[EpisodeData]]
@@ -28,9 +27,7 @@ def run_rollouts(options: BenchOptions) -> int:
     if options.data is None:
         raise ConfigError("bench rollouts needs --data FOLDER with recordings of one car; add it.")
     files = recordings_in(options.data)
-    recordings = [load_episodes(path) for path in files]
-    case = recorded_case(recordings, options.car, options.history)
-    console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
+    case, recordings = load_case(files, options.car, options.history)
     failures: list[str] = []
     curves_from = load_car_file(options.car).simulator if options.curves else None
     scores, stopped = run_study_parts(
@@ -67,8 +64,7 @@ def _jobs(
         )
 
     counts = checked_counts(case, recordings, options.rows, with_curves=options.curves)
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
-    return list(itertools.starmap(job, itertools.product(counts, seeds)))
+    return list(itertools.starmap(job, itertools.product(counts, options.all_seeds)))
 
 
 def _write(scores: Sequence[RolloutScore], options: BenchOptions) -> None:

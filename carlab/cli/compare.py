@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from carlab.api.comparison import compare
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
-from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of, report_folder
+from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, check_folder, options_of
 from carlab.cli.runs import search_callbacks
 
 
@@ -43,7 +43,7 @@ class Compare:
 
     def run(self) -> int:
         """Compare and print the changes."""
-        report_folder(self.out)
+        check_folder(self.out, f"--out {self.out}")
         with search_callbacks("comparison") as callbacks:
             found = compare(**arguments_of(self, compare), **callbacks)
         for fault in found.data_faults:

@@ -12,7 +12,7 @@ from carlab.api.diagnosis import diagnose
 from carlab.api.loaded_recordings import INCOMPLETE_FILE
 from carlab.cli.console import console, fail
 from carlab.cli.exit_codes import EXIT_INCONCLUSIVE
-from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, options_of, report_folder
+from carlab.cli.options import ARGUMENT_DEFAULT, arguments_of, check_folder, options_of
 from carlab.cli.recordings import print_errors
 from carlab.cli.runs import search_callbacks
 from carlab.core.errors import ConfigError
@@ -61,7 +61,7 @@ class Diagnose:
         """Diagnose and print the verdict."""
         if self.held_out == ():
             raise ConfigError("--held-out names no recording; name one or more after it, or remove the option.")
-        report_folder(self.out)
+        check_folder(self.out, f"--out {self.out}")
         arguments = arguments_of(self, diagnose) | {"held_out": self.held_out or ()}
         with search_callbacks("diagnosis") as callbacks:
             report = diagnose(**arguments, **callbacks)

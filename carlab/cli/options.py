@@ -113,19 +113,10 @@ def new_file(path: Path, option: str, suffix: str) -> None:
         raise ConfigError(f"{option} {path}: name a file that ends in {suffix}.")
     if path.exists():
         raise DataError(f"{path} exists already; remove it or choose another {option}.")
-    _check_folder(path.parent, f"{option} {path}")
+    check_folder(path.parent, f"{option} {path}")
 
 
-def report_folder(folder: Path) -> None:
-    """Check the folder of a report before the work begins; an earlier report in it will be replaced.
-
-    Raises:
-        DataError: it cannot be created or written.
-    """
-    _check_folder(folder, f"--out {folder}")
-
-
-def _check_folder(folder: Path, where: str) -> None:
+def check_folder(folder: Path, where: str) -> None:
     """Check that files can be written into a folder, which may be missing. Raises DataError that begins ``where``."""
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
@@ -154,6 +145,6 @@ def log_file(path: Path, option: str) -> None:
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first.")
     if not path.exists():
-        _check_folder(path.parent, f"{option} {path}")
+        check_folder(path.parent, f"{option} {path}")
     elif not os.access(path, os.W_OK):
         raise DataError(f"{option} {path}: it is not writable; choose another file or change its permissions.")

@@ -15,8 +15,8 @@ from carlab.api.recordings import load
 from carlab.benchmark.real.runner import RealProof
 from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, real_results_page, score_comparison
 from carlab.benchmark.world.measurement import COLUMNS
-from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console, fail, table
+from carlab.cli.recordings import recordings_in
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import FloatArray
 from carlab.recording.csv.export import table_of

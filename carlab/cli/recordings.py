@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from carlab.api.recordings import Recording, load
 from carlab.cli.console import console, table
 from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import FitErrors
@@ -17,6 +18,16 @@ if TYPE_CHECKING:
 
 MIN_TABLE_CHARS = 80
 """Width of the terminal below which findings are printed as paragraphs."""
+
+
+def recordings_in(folder: Path, min_count: int = 2) -> list[Path]:
+    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for fewer than ``min_count``."""
+    if not folder.is_dir():
+        raise ConfigError(f"--data {folder} is not a folder; name a folder with recordings (MCAP or CSV).")
+    files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
+    if len(files) < min_count:
+        raise DataError(f"{folder} has {len(files)} recordings; add some (at least {min_count}).")
+    return files
 
 
 def load_episodes(path: Path) -> Sequence[EpisodeData]:
