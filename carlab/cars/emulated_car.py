@@ -190,13 +190,7 @@ class EmulatedCar(Car):
         options: dict[str, Any] = {"kind": "vesc_serial", "port": addresses["port"]}
         if self._actuator == "can":
             options = {"kind": "vesc_can", "interface": "udp_multicast", "channel": addresses["can_channel"]}
-        mocap = MocapConfig(
-            mode="multicast" if self._config.mode == "multicast" else "unicast",
-            command_port=addresses["command_port"],
-            local_interface="127.0.0.1",
-            bitstream=self._config.bitstream,
-            body=BODY_NAME,
-        )
+        mocap = MocapConfig(command_port=addresses["command_port"], local_interface="127.0.0.1", body=BODY_NAME)
         return HardwareCar(
             self.name,
             Actuator(ActuatorConfig(**(options | self._actuator_options)), ActuatorCalibration()),

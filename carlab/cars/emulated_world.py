@@ -55,14 +55,11 @@ class WorldConfig:
     log: str = ""
     serial_link: str = ""
     can_channel: str = ""
-    controller_id: int = 23
     command_port: int = 0
     data_port: int = 0
     mode: str = "unicast"
     bitstream: str = "4.1"
-    multicast_group: str = "239.255.42.99"
     motor_timeout_s: float = 1.0
-    body: str = BODY_NAME
 
 
 class World:
@@ -84,7 +81,6 @@ class World:
             on_servo=self._on_servo,
             readings=self._readings,
             motor_timeout_s=config.motor_timeout_s,
-            controller_id=config.controller_id,
         )
         self.firmware: SerialFirmware | CanFirmware
         if config.actuator == "serial":
@@ -97,13 +93,12 @@ class World:
             self.firmware = CanFirmware(firmware, "udp_multicast", config.can_channel)
         self.server = NatNetServer(
             self._poses,
-            (EmulatedBody(config.body),),
+            (EmulatedBody(BODY_NAME),),
             rate_hz=simulator.mocap.rate_hz,
             mode="multicast" if config.mode == "multicast" else "unicast",
             version=config.bitstream,
             command_port=config.command_port,
             data_port=config.data_port,
-            multicast_group=config.multicast_group,
             seed=config.seed,
         )
         self._stack = ExitStack()

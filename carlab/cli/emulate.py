@@ -63,7 +63,7 @@ class Emulate:
         import tomli_w
 
         from carlab.cars import default_car, load_car_file
-        from carlab.cars.emulated_world import World, WorldConfig
+        from carlab.cars.emulated_world import BODY_NAME, World, WorldConfig
 
         self._check_options()
         valid_seed(seed=self.seed)
@@ -81,7 +81,7 @@ class Emulate:
                 channel = addresses["can_channel"]
                 actuator = {"kind": "vesc_can", "interface": "udp_multicast", "channel": channel}
             mocap = {"server_address": "127.0.0.1", "local_interface": "127.0.0.1", "mode": self.mode}
-            mocap |= {"command_port": addresses["command_port"], "body": config.body}
+            mocap |= {"command_port": addresses["command_port"], "body": BODY_NAME}
             hardware = {"actuator": actuator, "mocap": mocap, "calibration": asdict(ActuatorCalibration())}
             console.print(tomli_w.dumps({"hardware": hardware}).rstrip(), soft_wrap=True)
             console.print("^C ends it.")
