@@ -149,14 +149,9 @@ def run_study_parts(
 def bench_job(
     options: BenchOptions, rows: int | str, seed: int, more: Sequence[str], files: Mapping[str, bytes]
 ) -> ChildJob:
-    """The command of one number of rows and one seed; its figures are in the output ``FIGURES``.
+    """The command of one number of rows and one seed, with further options and contents of the files that it reads.
 
-    Args:
-        options: of the study.
-        rows: number of rows, or ``all``.
-        seed: of data and fit.
-        more: further options.
-        files: contents of the files that it reads.
+    Its figures are in the output ``FIGURES``.
     """
     command = [*CARLAB, "bench", str(options.what), "--out", FIGURES, "--rows", str(rows), "--seeds", "1"]
     command += ["--first-seed", str(seed), "--device", options.device, *more]

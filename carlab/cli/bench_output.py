@@ -57,18 +57,10 @@ def write_scores(new: Sequence[Score], scores: Sequence[Score], options: BenchOp
 
 
 def report(scores: Sequence[Score], stopped: bool, options: BenchOptions, title: str, first: str, *others: Path) -> int:
-    """Print and draw the scores of a study.
-
-    Args:
-        scores: scores of the study.
-        stopped: whether the study was ended early.
-        options: with the file that was written.
-        title: of the table.
-        first: header of the column with the compared methods.
-        others: further files that were written.
+    """Print and draw the scores of a study; ``first`` is the header of the column with the compared methods.
 
     Returns:
-        The exit code: interrupted, failed (at least one fit failed) or 0.
+        The exit code: interrupted (``stopped``), failed (at least one fit failed) or 0.
     """
     rows = summarised(scores)
     print_rows(f"{title}{', interrupted' if stopped else ''}", first, rows)

@@ -76,17 +76,7 @@ def can_stop_inside(corners_m: Polygon, state: CarState, reaction_s: float, dece
 def can_stop_inside_batch(
     corners_m: Polygon, places_m: FloatArray, course_rad: FloatArray, needed_m: FloatArray
 ) -> NDArray[np.bool_]:
-    """``can_stop_inside`` for a batch of cars.
-
-    Args:
-        corners_m: the polygon.
-        places_m: positions of the cars (n, 2).
-        course_rad: directions of motion over ground (n,).
-        needed_m: stopping distances (n,).
-
-    Returns:
-        Whether each car can stop inside (n,).
-    """
+    """Whether cars (n,) at places (n, 2) can stop inside, by their courses over ground and stopping distances (n,)."""
     x_m, y_m = places_m.T
     free = free_distance_m(corners_m, x_m, y_m, course_rad)
     found: NDArray[np.bool_] = contains(corners_m, x_m, y_m) & (needed_m < free) & (free < np.inf)

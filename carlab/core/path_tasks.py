@@ -135,10 +135,7 @@ class _ClosedPathTask(Task):
 def lap_times(times_s: FloatArray, travelled_m: FloatArray, length_m: float) -> list[float]:
     """Durations of complete laps [s]; the first starts when the car first passes the start line, or starts at it.
 
-    Args:
-        times_s: times (T,).
-        travelled_m: distances along the path from the start line (T,).
-        length_m: length of a lap.
+    ``travelled_m`` (T,) are the distances along the path from the start line at the times (T,).
     """
     crossings_s = []
     for lap in range(int(travelled_m.max() // length_m) + 1):

@@ -178,13 +178,7 @@ class FrozenPoseDetector:
         self._pose = None
 
     def problem(self, observation: Observation, sent: Action, now_s: float) -> str | None:
-        """Describe a frozen pose; None if the pose is not frozen.
-
-        Args:
-            observation: the newest observation.
-            sent: the last command that was sent.
-            now_s: time on the car's clock [s].
-        """
+        """Describe a frozen pose after the last command that was sent; None if the pose is not frozen."""
         state = observation.state
         must_move = observation.motor_is_turning is True and sent.throttle != 0.0
         if self._pose is None or not must_move or _has_moved(state, self._pose):

@@ -102,9 +102,7 @@ class TaskChoice:
 def choose_task(task: str | Task, track: Track | None = None) -> TaskChoice:
     """The task of a name, of FILE.py:CLASS, or of an object. Raises ConfigError for an unknown one.
 
-    Args:
-        task: the task.
-        track: for ``laps``; None: the default oval.
+    ``track`` is for ``laps``, by default the oval.
     """
     if isinstance(task, type):
         raise ConfigError(f"--task {task.__name__}: it is a class; give an object of it, {task.__name__}(...).")

@@ -18,11 +18,7 @@ _POLL_S = 0.1
 
 
 class PipeFile:
-    """Copies a pipe into a new file in a separate thread.
-
-    Args:
-        path: The new file; must not exist.
-    """
+    """Copies a pipe into a file, which must not exist, in a separate thread."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

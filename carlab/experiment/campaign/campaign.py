@@ -74,10 +74,6 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
 
     Ranges are those of the car file. Without them, the ``UNCERTAIN_PARAMETERS`` have a range of ``PRIOR_HALF_WIDTH``
     about their values.
-
-    Args:
-        car: simulator of the car file.
-        kind: tyre model of the prior.
     """
     values = car.values()
     if kind == "kinematic":
@@ -282,10 +278,7 @@ CONNECTION_TABLES = ("hardware", "mocap")
 def check_same_car(run: RunDirectory, choice: CarChoice, car_options: str) -> None:
     """Check that a campaign was started with the same car, its parameters and the same ``--dry-run``.
 
-    Args:
-        run: folder of the campaign.
-        choice: the car that resumes the campaign.
-        car_options: the command-line options that select the car.
+    ``car_options`` are the command-line options that select the car.
 
     Raises:
         ConfigError: it was started with another one.

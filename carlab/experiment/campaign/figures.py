@@ -130,11 +130,6 @@ def _with_nan(row: Mapping[str, Any]) -> dict[str, Any]:
 def figures_of(result: EpisodeResult, training: Mapping[str, Any], task: Task) -> EpisodeFigures:
     """Combine the result of an episode with the figures of the training before it.
 
-    Args:
-        result: of the episode.
-        training: as ``read_training_figures`` returns them.
-        task: states the outcome.
-
     Raises:
         ConfigError: the task cannot state the outcome.
     """

@@ -21,11 +21,7 @@ _TEXTS = ("history_message", "prior_change")
 
 
 def read_training_figures(folder: Path, episode: int) -> dict[str, Any]:
-    """Read the figures of the training before an episode.
-
-    Args:
-        folder: of model and policy.
-        episode: number of the episode.
+    """Read the figures of the training before an episode from the folder of its model and policy.
 
     Raises:
         DataError: the file cannot be read, a figure is missing or has another type, or it is of another episode. The

@@ -52,16 +52,7 @@ def draw(
     task: Task,
     path: Path,
 ) -> None:
-    """Write a PNG.
-
-    Args:
-        rows: one for each episode.
-        number: number of the shown episode.
-        episode: data of that episode.
-        predictions: of that episode, by the model fitted before it.
-        task: goal and arena.
-        path: file to write.
-    """
+    """Write a PNG with the learning curve, and an episode with its predictions by the model fitted before it."""
     from matplotlib.figure import Figure
 
     figure: Any = Figure(figsize=(16, 9))

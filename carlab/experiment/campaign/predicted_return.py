@@ -46,13 +46,7 @@ def predicted_figures(
 ) -> dict[str, Any]:
     """Median return and 90 % interval of a policy, and sufficient ticks if those of an episode are too few.
 
-    Args:
-        plan: settings of the run with the current prior.
-        agent: the policy.
-        learned: the learned car.
-        episodes: recordings so far.
-        envelope: limits of the car's safety gate.
-        seed: of all draws.
+    The plan has the current prior. The envelope has the limits of the car's safety gate.
     """
     totals = [learned.roll_out(agent.act).returns.numpy()]
     shares = [1.0]

@@ -161,13 +161,7 @@ def needed_history(simulator: SimulatorConfig) -> int:
 
 
 def next_version(before: PriorVersion, car: SimulatorConfig, found: Findings) -> PriorVersion:
-    """The next version of the prior, with the sentence that states what changed and why.
-
-    Args:
-        before: the current version.
-        car: simulator of the car file.
-        found: what is known after the newest episode.
-    """
+    """The next version of the prior, with the sentence that states what changed and why."""
     if found.diagnosed is not None:
         after, why = _by_diagnosis(before, found)
     else:

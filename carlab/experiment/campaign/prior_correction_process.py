@@ -121,13 +121,8 @@ def contradicted_by(
 ) -> tuple[str, ...]:
     """Ids of the corrections without which an episode is predicted better, by backward elimination.
 
-    The loss is Huber's over the windows of the episode.
-
-    Args:
-        newest: an episode that no tested correction was fitted to.
-        car: simulator of the car file.
-        corrections: those of the current prior.
-        tested: the corrections to test.
+    The loss is Huber's over the windows of the episode, which no tested correction was fitted to. The other
+    corrections of the current prior remain.
     """
     from carlab.diagnosis.quick.quick_check import held_out_loss
 

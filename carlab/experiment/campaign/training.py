@@ -216,15 +216,9 @@ def _environments(
 def _trained_policy(
     plan: TrainingPlan, training: ModelEnv, evaluation: ModelEnv, earlier: Path | None, updates: int, progress: Progress
 ) -> tuple[SacAgent, dict[str, Any]]:
-    """Train a policy, starting from the previous one if it exists; returns the policy and its figures.
+    """Train a policy, starting from the previous one if its folder is given; returns the policy and its figures.
 
-    Args:
-        plan: settings of the run.
-        training: environment of the training.
-        evaluation: environment of the evaluation, which selects the best policy.
-        earlier: folder of the previous policy.
-        updates: gradient steps.
-        progress: as for ``train``.
+    The evaluation selects the best policy of the training.
     """
     task, sac = plan.task, SacSettings()
     sac = replace(sac, discount=sac.discount ** reference_ticks(plan.control_period_s))
@@ -304,13 +298,7 @@ def _fitted_to_rollouts(
 ) -> CarDynamics:
     """Fit the car to rollouts over windows of the episodes; the same car if there are too few.
 
-    Args:
-        car: fitted to ``rows``.
-        episodes: all usable recordings.
-        rows: their transitions.
-        settings: of the fit to the rows.
-        rate_factor: factor on the learning rate.
-        progress: as for ``train``.
+    The car was fitted to ``rows``, the transitions of the episodes, by ``settings``.
     """
     try:
         windows = drive_windows(recorded_windows(episodes, ROLLOUT_HORIZON_S, ROLLOUT_STRIDE_S), car.history)

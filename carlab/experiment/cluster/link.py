@@ -32,13 +32,7 @@ Call = Callable[..., Any]
 
 
 class RayService:
-    """The training service as a Ray actor with a name, which is created unless it exists.
-
-    Args:
-        address: of the cluster.
-        name: of the service.
-        device: of the training; ``cuda`` reserves one GPU.
-        settings: times of the link.
+    """The training service as a Ray actor with a name, which is created unless it exists; ``cuda`` reserves one GPU.
 
     Raises:
         ConfigError: no cluster answers, or no machine of it has a GPU.
@@ -89,12 +83,8 @@ def run_order(
 ) -> None:
     """Send the files of an order, wait for its training, and write the result.
 
-    Args:
-        call: calls a method of the training service by its name.
-        request: folders of order and result.
-        emit: receives what happens; the last event is ``done``, ``failed`` or ``lost worker``.
-        settings: times of the link.
-        pause: waits for a number of seconds.
+    ``emit`` receives what happens; the last event is ``done``, ``failed`` or ``lost worker``. ``pause`` waits for a
+    number of seconds.
     """
     files = read_files(Path(request.order), ".")
     manifest = {name: sha256(content) for name, content in files.items()}
@@ -118,14 +108,7 @@ def run_order(
 
 
 def serve(open_service: Callable[[], RayService], requests: Iterable[str], emit: Emit, settings: LinkSettings) -> None:
-    """Connect, and run one order after the other; every error is an event.
-
-    Args:
-        open_service: connects to the cluster.
-        requests: lines of ``LinkRequest``.
-        emit: receives what happens.
-        settings: times of the link.
-    """
+    """Connect, and run one order (a line of ``LinkRequest``) after the other; every error is an event."""
     clock = MonotonicClock()
     try:
         service = open_service()

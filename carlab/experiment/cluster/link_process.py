@@ -21,11 +21,7 @@ END_TIMEOUT_S = 4.0
 class LinkProcess:
     """The link as a process with its own session, so that ^C reaches only the run.
 
-    Args:
-        address: of the cluster.
-        name: of the training service.
-        device: of the training.
-        program: of the process, without these arguments.
+    Address of the cluster, name of the training service and device of the training are the arguments of ``program``.
     """
 
     def __init__(self, address: str, name: str, device: str, program: Sequence[str] = PROGRAM) -> None:

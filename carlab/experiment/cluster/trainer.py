@@ -126,14 +126,7 @@ class ClusterTrainer:
 
 
 class _Waiting:
-    """One training on the cluster.
-
-    Args:
-        trainer: with the link.
-        request: for the link.
-        number: of the episode after the training.
-        progress: of the training.
-    """
+    """One training on the cluster, before the episode ``number``."""
 
     def __init__(self, trainer: ClusterTrainer, request: LinkRequest, number: int, progress: Progress) -> None:
         self._trainer = trainer

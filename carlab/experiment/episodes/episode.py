@@ -326,10 +326,7 @@ def _evaluate_transition(
 def _end_of(error: BaseException, state: SafetyState, *, driven: bool) -> tuple[EndReason, str, bool]:
     """End reason and detail of an error, and whether ``run_episode`` returns the episode instead of raising.
 
-    Args:
-        error: raised by the loop.
-        state: of the safety gate.
-        driven: whether a tick was completed.
+    ``driven`` states whether a tick was completed.
     """
     match error:
         case _End() | SafetyStop():

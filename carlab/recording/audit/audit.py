@@ -72,11 +72,8 @@ def audit_channels(
 ) -> tuple[list[Finding], BoolArray]:
     """Check all but order, gaps, jumps and heading.
 
-    Args:
-        channels: the recording.
-        mapping: meaning of the columns.
-        heading: findings of ``check_heading``. A wrong yaw makes right velocities and commands look wrong, so these
-            are not checked then.
+    ``heading`` are the findings of ``check_heading``. A wrong yaw makes right velocities and commands look wrong, so
+    these are not checked then.
 
     Returns:
         Findings and the mask of rows with a yaw_rate spike, (N,).

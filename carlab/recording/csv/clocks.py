@@ -54,13 +54,10 @@ def with_rebuilt_clock(channels: Channels) -> tuple[Channels, str]:
 
 
 def even_clock(t_s: FloatArray) -> tuple[FloatArray, list[Finding]]:
-    """Estimate the frame times of a source with constant rate from its arrival stamps.
+    """Estimate the frame times of a source with constant rate from its arrival stamps (N,) [s] with jitter.
 
     Fits a straight line to the stamps of each part without a gap. A permanent step by an integer number of periods is a
     lost frame and is kept. Parts of less than ``_MIN_ROWS`` rows keep their stamps.
-
-    Args:
-        t_s: arrival stamps (N,) [s] with jitter.
 
     Returns:
         Frame times (N,) [s] from 0 and a finding; the stamps and no finding if every part is too short.

@@ -65,14 +65,10 @@ class ImportedRecording:
 
 
 def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
-    """Import a .csv or .csv.gz file.
+    """Import a .csv or .csv.gz file by the meaning of its columns, by default recognised by the header.
 
     A command is sent at the time of its row and held until the next row: N rows give N states and N - 1 commands. The
     command of the last row is dropped. Times start at the first row. The row rate is unchanged.
-
-    Args:
-        path: the file.
-        mapping: meaning of the columns; by default recognised by the header.
 
     Raises:
         DataError: the file is not a CSV, a column is missing, a cell is not a number, time does not increase or has

@@ -19,14 +19,10 @@ _MAX_ITERATIONS = 6
 
 
 def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
-    """Import a CSV and repair errors for which the audit proposes a safe option.
+    """Import a CSV as ``import_csv`` does, and repair errors for which the audit proposes a safe option.
 
     Repairs: declares the units of pose and velocities, drops rows with a missing value or a stamp that does not
     increase, and keeps gaps in time (``segment`` in ``extra`` numbers the parts between them).
-
-    Args:
-        path: a .csv or .csv.gz file.
-        mapping: meaning of the columns; by default recognised by the header.
 
     Raises:
         DataError: the file cannot be read, or has an error without such a repair.

@@ -83,10 +83,7 @@ class GridMotion:
 def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> GridMotion:
     """Velocities by the pose, and the forward acceleration dvx/dt - vy r, on a grid of 20 ms or the row period.
 
-    Args:
-        t_s: stamps (N,).
-        motion: motion of the pose at the stamps.
-        segment: number of the unbroken stretch (N,).
+    ``motion`` and ``segment`` (N,), the number of the unbroken stretch, are those at the stamps (N,).
     """
     period = float(np.median(np.diff(t_s)))
     step = max(period, GRID_S)

@@ -85,13 +85,8 @@ def _largest_ratio(error: FloatArray, limit: FloatArray) -> FloatArray:
 def frozen_rows(t_s: FloatArray, state: FloatArray, sensor: FloatArray, threshold: float) -> BoolArray:
     """Rows (N,) in which the pose stands still for half a second while a sensor of that motion exceeds a threshold.
 
-    Half a second is longer than the lag of such a sensor (0.1 to 0.2 s) when the car stops.
-
-    Args:
-        t_s: stamps (N,).
-        state: velocity of the pose (N,) that the sensor measures, in m/s or rad/s.
-        sensor: values of the sensor (N,).
-        threshold: in the unit of the sensor.
+    Half a second is longer than the lag of such a sensor (0.1 to 0.2 s) when the car stops. ``state`` (N,) is the
+    velocity of the pose that the sensor (N,) measures, in m/s or rad/s.
     """
     frozen = np.zeros(len(t_s), dtype=bool)
     for first, last in runs((np.abs(state) < 0.02) & (np.abs(sensor) > threshold)):

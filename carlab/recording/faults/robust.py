@@ -49,11 +49,7 @@ def held_at(t_s: FloatArray, command: FloatArray, lag_s: float) -> FloatArray:
 def held_means(t_s: FloatArray, held: FloatArray, begin_s: FloatArray, width_s: FloatArray | float) -> FloatArray:
     """Means (n,) over [begin, begin + width) of a value (N,) that is held from each of ``t_s`` (N,) on.
 
-    Args:
-        t_s: stamps (N,).
-        held: values (N,).
-        begin_s: begins of the intervals (n,).
-        width_s: their widths, one number or (n,).
+    ``begin_s`` is (n,); ``width_s`` is one number or (n,).
     """
     integral = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(t_s))])
 

@@ -27,11 +27,8 @@ def periods_by_distance(position: FloatArray, velocity: FloatArray, segment: Flo
     """Time from row to row by distance over speed [s], shape (N - 1,); NaN at low speed and across breaks.
 
     Right where the velocity columns are backward differences of the pose by the true period, as loggers make them.
-
-    Args:
-        position: x and y (2, N) [m].
-        velocity: vx and vy (2, N) [m/s], in any frame.
-        segment: number of the unbroken stretch (N,).
+    ``position`` (2, N) is x and y [m], ``velocity`` (2, N) is vx and vy [m/s] in any frame, and ``segment`` (N,) is the
+    number of the unbroken stretch.
     """
     distance = np.hypot(*np.diff(position, axis=1))
     speed = np.hypot(*velocity)[1:]
