@@ -115,14 +115,18 @@ def limit(requested: Action, previous: Action, dt_s: float, envelope: SafetyEnve
     )
 
 
+def _moved(now: CarState, then: CarState) -> tuple[float, float]:
+    """Distance [m] and angle [rad] between two poses."""
+    return math.hypot(now.x_m - then.x_m, now.y_m - then.y_m), abs(float(wrap(now.yaw_rad - then.yaw_rad)))
+
+
 def pose_jump(observation: Observation, previous: Observation, envelope: SafetyEnvelope) -> str | None:
     """Describe a pose change since ``previous`` that exceeds the car's speed or yaw rate; None if it is possible."""
     then, now = previous.state, observation.state
     dt_s = max(
         observation.t_capture_s - previous.t_capture_s, observation.t_receive_s - previous.t_receive_s, 0.0
     )  # Capture times alone fail after a step of the camera's clock, arrival times alone in a burst.
-    moved_m = math.hypot(now.x_m - then.x_m, now.y_m - then.y_m)
-    turned_rad = abs(float(wrap(now.yaw_rad - then.yaw_rad)))
+    moved_m, turned_rad = _moved(now, then)
     if (
         moved_m <= envelope.max_speed_mps * dt_s + envelope.jump_margin_m
         and turned_rad <= envelope.max_yaw_rate_radps * dt_s + envelope.jump_margin_rad
@@ -181,7 +185,8 @@ class FrozenPoseDetector:
         """Describe a frozen pose after the last command that was sent; None if the pose is not frozen."""
         state = observation.state
         must_move = observation.motor_is_turning is True and sent.throttle != 0.0
-        if self._pose is None or not must_move or _has_moved(state, self._pose):
+        moved_m, turned_rad = (math.inf, 0.0) if self._pose is None else _moved(state, self._pose)
+        if not must_move or moved_m > FROZEN_POSITION_M or turned_rad > FROZEN_YAW_RAD:
             self._pose, self._since_s = state, now_s
             return None
         frozen_s = now_s - self._since_s
@@ -221,12 +226,6 @@ class LatePoseDetector:
         latency_ms = (observation.t_receive_s - observation.t_capture_s) * 1e3
         normal_ms = self._normal_latency_s * 1e3
         return f"The poses arrive {latency_ms:.0f} ms after their exposure; before, it was {normal_ms:.0f} ms."
-
-
-def _has_moved(now: CarState, then: CarState) -> bool:
-    moved_m = math.hypot(now.x_m - then.x_m, now.y_m - then.y_m)
-    turned_rad = abs(float(wrap(now.yaw_rad - then.yaw_rad)))
-    return moved_m > FROZEN_POSITION_M or turned_rad > FROZEN_YAW_RAD
 
 
 class SafetyState(enum.Enum):

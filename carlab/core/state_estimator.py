@@ -108,7 +108,11 @@ class StateEstimator:
             yaw_rad = before + wrap(yaw_rad - before)
         self._poses.append((sample.t_capture_s, sample.x_m, sample.y_m, yaw_rad))
         self._newest = sample
-        self._discard_old()
+        # Half a microsecond of tolerance keeps a sample that is exactly one window old despite rounding.
+        while (span_s := sample.t_capture_s - self._poses[0][0]) > self.window_s + 5e-7 and (
+            len(self._poses) > MIN_SAMPLES or span_s > MAX_SPAN_WINDOWS * self.window_s
+        ):
+            self._poses.popleft()
 
     def estimate(self) -> tuple[CarState, float] | None:
         """State with the newest pose, and the delay of its velocities relative to that pose [s].
@@ -125,11 +129,3 @@ class StateEstimator:
         fit = fit_velocity(np.array(self._poses))
         state = CarState(x_m, y_m, yaw_rad, fit.vx_mps, fit.vy_mps, fit.yaw_rate_radps)
         return state, newest.t_capture_s - fit.t_s
-
-    def _discard_old(self) -> None:
-        newest_s = self._poses[-1][0]
-        # Half a microsecond of tolerance keeps a sample that is exactly one window old despite rounding.
-        while newest_s - self._poses[0][0] > self.window_s + 5e-7 and (
-            len(self._poses) > MIN_SAMPLES or newest_s - self._poses[0][0] > MAX_SPAN_WINDOWS * self.window_s
-        ):
-            self._poses.popleft()

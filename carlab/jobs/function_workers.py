@@ -77,10 +77,12 @@ class FunctionWorkers:
             The results in the order of the arguments; None for calls that did not begin.
         """
         calls = _Calls(function, arguments)
-        children = self._started_children() if len(arguments) > 1 and not self._child_failed else []
+        is_shared = len(arguments) > 1 and not self._child_failed
+        while is_shared and len(self._children) < self.processes - 1:
+            self._children.append(_Child())
         threads = [
             threading.Thread(target=calls.make_in, args=(child,), name="function worker", daemon=True)
-            for child in children
+            for child in (self._children if is_shared else ())
         ]
         for thread in threads:
             thread.start()
@@ -110,11 +112,6 @@ class FunctionWorkers:
         for child in self._children:
             child.kill()
         self._children = []
-
-    def _started_children(self) -> list[_Child]:
-        while len(self._children) < self.processes - 1:
-            self._children.append(_Child())
-        return self._children
 
 
 class _Child:

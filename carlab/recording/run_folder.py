@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import importlib.metadata
+import itertools
 import json
 import logging
 import os
@@ -76,10 +77,11 @@ class RunDirectory:
         facts = environment()
         with writing(base):
             base.parent.mkdir(parents=True, exist_ok=True)
-            path, number = base, 1
-            while not _create_folder(path):
-                number += 1
-                path = base.with_name(f"{base.name}-{number}")
+            for number in itertools.count(1):
+                path = base if number == 1 else base.with_name(f"{base.name}-{number}")
+                with contextlib.suppress(FileExistsError):
+                    path.mkdir()
+                    break
             run = cls(path)
             try:
                 run.episodes.mkdir()
@@ -198,14 +200,6 @@ class RunDirectory:
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file atomically. Raises DataError if that fails."""
         write_json(self.path / name, content, default=str)
-
-
-def _create_folder(path: Path) -> bool:
-    try:
-        path.mkdir()
-    except FileExistsError:
-        return False
-    return True
 
 
 class _LogFile(logging.FileHandler):

@@ -188,7 +188,7 @@ def _by_diagnosis(before: PriorVersion, found: Findings) -> tuple[tuple[Correcti
         else:
             after.append(c)  # A search that was cut short refutes nothing.
     if not why:
-        why = [f"the diagnosis of {found.episodes} episodes confirms {_listed(after)}"] if after else []
+        why = [f"the diagnosis of {found.episodes} episodes confirms {', '.join(c.id for c in after)}"] if after else []
     return tuple(after), why
 
 
@@ -251,7 +251,3 @@ def _sentence(why: Sequence[str], found: Findings) -> str:
 
 def _ids(corrections: Sequence[Correction]) -> set[str]:
     return {c.id for c in corrections}
-
-
-def _listed(corrections: Sequence[Correction]) -> str:
-    return ", ".join(c.id for c in corrections)

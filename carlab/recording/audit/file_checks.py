@@ -255,20 +255,15 @@ def check_held(t_s: FloatArray, columns: Mapping[str, FloatArray]) -> list[Findi
     return findings
 
 
-def _count(repeats: BoolArray) -> str:
-    """Number of rows (N,) that repeat something, with the verb."""
-    number = int(repeats.sum())
-    return "1 row repeats" if number == 1 else f"{number} rows repeat"
-
-
 def check_stale(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Finding]:
     """Rows that repeat the pose before while the car moves; ``values`` has x, y and yaw, each (N,)."""
     stale = stale_rows(t_s, np.column_stack([values[name] for name in POSE_CHANNELS]))
     if not stale.any():
         return []
     severity = Severity.WARNING if stale.mean() > 0.01 else Severity.INFO
+    repeats = "1 row repeats" if stale.sum() == 1 else f"{stale.sum()} rows repeat"
     sentence = (
-        f"{_count(stale)} the pose of the row before although the car moves (first row "
+        f"{repeats} the pose of the row before although the car moves (first row "
         f"{np.argmax(stale) + 1}): the logger was faster than the camera system or lost a frame."
     )
     return [Finding.at(stale, "stale_samples", "x, y, yaw", severity, sentence)]
@@ -306,8 +301,10 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
         beyond = np.abs(column) > 1.0 + 1e-6
         if beyond.any():
             severity = Severity.ERROR if largest > MAX_COMMAND else Severity.WARNING
-            unscaled = max(largest / abs(mapping.columns[channel].scale), 1.0)  # the option replaces this scale
-            option: str | None = f"--{channel}-scale {_rounded_down(1.0 / _full_scale(channel, unscaled))}"
+            full_command = max(largest / abs(mapping.columns[channel].scale), 1.0)  # the option replaces this scale
+            if channel == "throttle" and MAX_COMMAND < full_command <= 100.0:
+                full_command = 100.0  # per cent
+            option: str | None = f"--{channel}-scale {_rounded_down(1.0 / full_command)}"
             remedy = f"say what full command is, for example {option}"
             if float(column.min()) >= MIN_PULSE:
                 option = None
@@ -325,11 +322,6 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
             sentence = f"Column '{name}' ({channel}) is {column[0]:.3g} throughout: its effect cannot be identified."
             findings.append(Finding("constant_command", channel, Severity.WARNING, sentence, len(column)))
     return findings
-
-
-def _full_scale(channel: str, largest: float) -> float:
-    """A plausible full command in the unit of a column: 100 for a throttle in per cent, else the largest command."""
-    return 100.0 if channel == "throttle" and MAX_COMMAND < largest <= 100.0 else largest
 
 
 def _rounded_down(value: float) -> str:

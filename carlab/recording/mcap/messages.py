@@ -67,7 +67,10 @@ def encode(item: Item, unix: UnixMapping, now_s: float) -> Iterator[Stamped]:
         case Tick():
             yield from _tick(item, unix)
         case Transition():
-            yield _transition(item)
+            features, next_features = (np.asarray(each).tolist() for each in (item.features, item.next_features))
+            action = {"steering": item.action.steering, "throttle": item.action.throttle}
+            transition = _message("Transition", item, features=features, next_features=next_features, **action)
+            yield Stamped(schemas.TRANSITION_TOPIC, transition, item.t_s, item.t_s, item.step)
         case SafetyEvent():
             event = schemas.CLASSES["SafetyEvent"](t_s=item.t_s, kind=text(item.kind), text=text(item.text))
             yield Stamped(schemas.EVENT_TOPIC, event, item.t_s, item.t_s)
@@ -109,13 +112,6 @@ def _tick(item: Tick, unix: UnixMapping) -> Iterator[Stamped]:
     features = np.asarray(item.features).tolist()
     tick = _message("Tick", item, safety_state=text(item.safety_state), features=features)
     yield Stamped(schemas.TICK_TOPIC, tick, item.t_s, item.observation.t_capture_s, item.step)
-
-
-def _transition(item: Transition) -> Stamped:
-    features, next_features = (np.asarray(each).tolist() for each in (item.features, item.next_features))
-    action = {"steering": item.action.steering, "throttle": item.action.throttle}
-    transition = _message("Transition", item, features=features, next_features=next_features, **action)
-    return Stamped(schemas.TRANSITION_TOPIC, transition, item.t_s, item.t_s, item.step)
 
 
 def _observation(seen: Observation, step: int, t_s: float, unix: UnixMapping) -> Iterator[Stamped]:
