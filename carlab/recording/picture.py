@@ -172,25 +172,17 @@ def _draw_start_and_end(plan: Any, episode: EpisodeData, color: str, *, first: b
 
 
 def _draw_commands(axis: Any, episodes: Sequence[EpisodeData]) -> None:
+    is_single = len(episodes) == 1
     for k, episode in enumerate(episodes):
         t_s = (episode.times_s - episode.times_s[0])[:-1]
-        is_single = len(episodes) == 1
         for channel, (name, style) in enumerate((("steering", "-"), ("throttle", (0, (4, 1.5))))):
-            color = _PALETTE[channel] if is_single else _color(k)
+            requested, sent = episode.requested[:, channel], episode.sent[:, channel]
             if is_single:
-                requested = episode.requested[:, channel]
-                axis.step(
-                    t_s,
-                    requested,
-                    where="post",
-                    color=_LIGHT_GREY,
-                    linewidth=3.0,
-                    label="requested" if channel else None,
-                )
+                label = "requested" if channel else None
+                axis.step(t_s, requested, where="post", color=_LIGHT_GREY, linewidth=3.0, label=label)
+            color = _PALETTE[channel] if is_single else _color(k)
             label = name if k == 0 else None
-            axis.step(
-                t_s, episode.sent[:, channel], where="post", color=color, linestyle=style, linewidth=1.3, label=label
-            )
+            axis.step(t_s, sent, where="post", color=color, linestyle=style, linewidth=1.3, label=label)
     commands = np.vstack([np.abs(a) for e in episodes for a in (e.sent, e.requested)])
     max_command = float(np.nanmax(commands, initial=1.0, where=np.isfinite(commands)))
     axis.set_ylim(-1.15 * min(max_command, 2.0), 1.15 * min(max_command, 2.0))
