@@ -353,11 +353,13 @@ def recognise_layout(header: Sequence[str], where: str, rate_hz: float | None = 
     lacking = missing_columns(nearest, header)
     names = [source.name for source in nearest.columns.values()]
     spare = [name for name in header if name not in names]
-    near = difflib.get_close_matches(lacking[0].split(" (")[0], spare, n=1, cutoff=0.4)
+    has_quaternion = "yaw" in lacking and any(_QUATERNION.search(name) for name in header)
+    wanted = [name for name in lacking if name != "yaw" or not has_quaternion]
+    near = difflib.get_close_matches(wanted[0].split(" (")[0], spare, n=1, cutoff=0.4) if wanted else []
     hint = f" (is it '{near[0]}'?)" if near else ""
     lacks_time_only = rate_hz is None and len(lacking) == 1 and nearest.columns["t"].name not in header
     steps = "give the rate of the rows with --rate, " if lacks_time_only else ""
-    if "yaw" in lacking and any(_QUATERNION.search(name) for name in header):
+    if has_quaternion:
         steps += "compute yaw from the quaternion as atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)), "
     raise DataError(
         f"{where} has no column {', '.join(lacking)}{hint}; it holds {', '.join(header)}; "

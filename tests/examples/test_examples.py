@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import carlab
+from carlab.core.angles import wrap
 from carlab.core.observation import encode
 from carlab.core.task import Task
 from learning.policy.sac_agent import SacSettings
@@ -22,6 +24,7 @@ SCRIPTS = {
     "write_task.py": [],
     "fit_sim_fsvgd.py": ["--steps", "400"],
     "add_effect.py": ["--seconds", "20"],
+    "join_logs.py": [],
     "diagnose_csv.py": ["--seconds", "20", "--effects", "steering_lag"],
     "train_in_learned_car.py": FEW_STEPS,
     "demo.py": ["--car", "sim", "--episodes", "1", *FEW_STEPS, "--effects", "steering_lag"],
@@ -65,6 +68,36 @@ def test_posterior_of_own_arrays_predicts_between_the_rows(output_of: Example) -
     predicted, std, true = map(float, re.findall(r"[+-]?\d\.\d\d", line))
     assert predicted == pytest.approx(true, abs=0.1)
     assert 0.0 < std < 0.2
+
+
+def test_poses_and_commands_of_two_programs_are_joined(output_of: Example, tmp_path: Path) -> None:
+    assert "1 episode" in output_of("join_logs.py")
+    drive = carlab.load(next(tmp_path.glob("runs/*/episodes/0001.mcap"))).episodes[0]
+    table = np.genfromtxt(tmp_path / "runs" / "joined.csv", delimiter=",", names=True)
+    t_s = table["t"] + drive.times_s[0]  # the log of the commands begins with the first tick
+    poses = np.array([np.interp(t_s, drive.poses[:, 0], np.unwrap(drive.poses[:, k])) for k in (1, 2, 3)])
+    assert np.abs(table["x"] - poses[0]).max() < 1e-5
+    assert np.abs(table["y"] - poses[1]).max() < 1e-5
+    assert np.abs(wrap(table["yaw"] - poses[2])).max() < 1e-5
+    for time_s, steering, throttle in zip(t_s, table["steering"], table["throttle"], strict=True):
+        sent = drive.sent[np.flatnonzero(drive.times_s <= time_s + 1e-6)[-1]]
+        assert (steering, throttle) == pytest.approx(sent, abs=1e-4)
+
+
+def test_pose_of_a_motive_export_is_that_of_the_rigid_body(tmp_path: Path) -> None:
+    """Y up: a car at X = 1 m, Z = -2 m that is turned to the left by 90 degrees is at x = 1 m, y = 2 m."""
+    motive_poses = runpy.run_path(str(EXAMPLES / "join_logs.py"))["motive_poses"]
+    half = np.sqrt(0.5)
+    take = tmp_path / "take.csv"
+    take.write_text(
+        "Format Version,1.23,Rotation Type,Quaternion,Length Units,Meters\n\n"
+        f",Type{',Rigid Body' * 8},Marker\n,Name{',other'}{',car' * 7},car:1\n,ID{',1' * 9}\n,Parent{',' * 9}\n"
+        ",,Position,Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Position\n"
+        "Frame,Time (Seconds),X,X,Y,Z,W,X,Y,Z,X\n"
+        f"0,0.0,9,0,{half},0,{half},1,0.05,-2,8\n1,0.5,9,,,,,,,,8\n2,1.0,9,0,0,0,1,3,0.05,0,8\n",
+        encoding="utf-8",
+    )
+    assert motive_poses(take, "car", "y") == pytest.approx(np.array([[0, 1, 2, np.pi / 2], [1, 3, 0, 0]]))
 
 
 def test_own_policy_holds_its_target_speed(output_of: Example) -> None:

@@ -58,7 +58,20 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
             bad[-1] &= channel not in COMMAND_CHANNELS
         whole &= ~(is_missing | is_too_large)
         findings += _cell_findings(channel, column, is_missing, is_too_large, mapping)
+    is_empty_column = any(finding.evidence.get("share") == 1.0 for finding in findings)
+    if findings and whole.sum() < MIN_ROWS and not is_empty_column:
+        findings = [_joined_messages_finding(values, whole)]
     return findings, whole
+
+
+def _joined_messages_finding(values: Mapping[str, FloatArray], whole: BoolArray) -> Finding:
+    """The fault of a table whose rows are messages of different topics, as ``values`` (N,) by channel show."""
+    sentence = (
+        f"Only {whole.sum()} of {len(whole)} rows have a number in each of {', '.join(values)}: the rows are messages "
+        "of different topics; write one row for each pose, with the newest command before it (pandas.merge_asof, or "
+        "examples/join_logs.py)."
+    )
+    return Finding.at(~whole, "joined_messages", "pose, commands", Severity.ERROR, sentence)
 
 
 def _cell_findings(

@@ -62,6 +62,11 @@ def read_csv(path: Path | str) -> CsvTable:
     """
     path = Path(path)
     text = _without_comments(_read_text(path))
+    if text.startswith("Format Version,"):
+        raise DataError(
+            f"{path.name} is an export of Motive, which has poses and no commands; join it with the log of the "
+            "commands, as examples/join_logs.py does."
+        )
     first = text.split("\n", 1)[0]
     delimiter = max(",;\t", key=first.count)
     try:

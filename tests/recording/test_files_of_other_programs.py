@@ -1,0 +1,65 @@
+"""Files of Motive and of ROS tools, which have other tables than carlab, are refused with the remedy that helps."""
+
+import foreign_drive as foreign
+import numpy as np
+import pytest
+
+from carlab.core.errors import DataError
+from carlab.recording.audit.report import RefusedError
+from carlab.recording.column_mapping import CANONICAL, recognise_layout
+from carlab.recording.csv.foreign import import_csv
+from carlab.recording.csv.repairing_import import import_repaired
+
+MOTIVE = """Format Version,1.23,Take Name,Take 1,Export Frame Rate,120.000000,Rotation Type,Quaternion
+
+,Type,Rigid Body,Rigid Body
+,Name,car,car
+Frame,Time (Seconds),X,Y
+0,0.0,0.1,0.2
+"""
+
+
+def test_export_of_motive_is_refused_with_the_script_that_joins_the_commands(tmp_path):
+    path = tmp_path / "take.csv"
+    path.write_text(MOTIVE, encoding="utf-8")
+    with pytest.raises(DataError, match=r"is an export of Motive.*no commands.*examples/join_logs\.py"):
+        import_csv(path)
+
+
+def joined_topics(n_rows=400):
+    """A table as ROS tools export several topics: a row has a number in the columns of one message only."""
+    columns = foreign.drive(np.arange(n_rows) / 60.0)
+    is_pose = np.arange(n_rows) % 2 == 0
+    return {
+        name: column if name == "t" else np.where(is_pose == (name not in ("steering", "throttle")), column, np.nan)
+        for name, column in columns.items()
+    }
+
+
+@pytest.mark.parametrize("options", [{}, {"missing": "drop"}])
+def test_rows_of_different_topics_have_another_remedy_than_dropping_all_rows(tmp_path, options):
+    path = foreign.write(tmp_path / "bag.csv", joined_topics())
+    with pytest.raises(RefusedError) as error:
+        import_csv(path, mapping=CANONICAL.with_options(**options))
+    text = str(error.value)
+    assert "Only 0 of 400 rows have a number in each of t, x, y, yaw" in text
+    assert "messages of different topics" in text
+    assert "merge_asof" in text
+    assert "--missing drop" not in text
+    assert len(error.value.findings) == 1
+    with pytest.raises(RefusedError, match="messages of different topics"):
+        import_repaired(path)
+
+
+def test_rows_without_a_pose_are_no_other_topic(tmp_path):
+    columns = foreign.drive(np.arange(400) / 60.0)
+    columns["x"][40:300] = np.nan
+    with pytest.raises(RefusedError, match=r"no number in 260 of 400 rows.*--missing drop"):
+        import_csv(foreign.write(tmp_path / "lost.csv", columns), mapping=CANONICAL)
+
+
+def test_part_of_a_quaternion_is_not_proposed_as_yaw():
+    with pytest.raises(DataError) as error:
+        recognise_layout(["t", "x", "y", "qx", "qy", "qz", "qw", "steering", "throttle"], "drive.csv")
+    assert "has no column yaw; it holds" in str(error.value)
+    assert "compute yaw from the quaternion" in str(error.value)
