@@ -255,10 +255,13 @@ def environment() -> dict[str, Any]:
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:
-    """Commit and whether tracked files differ from it (``dirty``); None outside a repository or without git."""
+    """Commit and whether tracked files differ from it (``dirty``); None outside a repository or without git.
+
+    Git writes nothing to the repository: if ^C ended it while it wrote, its lock would block later git commands.
+    """
 
     def git(*arguments: str) -> str:
-        command = ("git", "-C", str(folder), *arguments)
+        command = ("git", "--no-optional-locks", "-C", str(folder), *arguments)
         done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
         return done.stdout.strip()
 

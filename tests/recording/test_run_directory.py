@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 import subprocess
 import unicodedata
@@ -118,6 +119,20 @@ def test_git_state_distinguishes_changed_and_clean_trees(tmp_path):
     (tmp_path / "a").write_text("2")
     assert git_state(tmp_path) == {**clean, "dirty": True}
     assert environment()["carlab"]
+
+
+def test_git_state_writes_nothing_to_the_repository(tmp_path: Path) -> None:
+    """git status saves new time stamps of files under index.lock, which stays if ^C ends git meanwhile."""
+    identity = ("-c", "user.name=n", "-c", "user.email=e@example.org")
+    (tmp_path / "a").write_text("1")
+    for arguments in (("init",), ("add", "a"), ("commit", "-m", "one")):
+        subprocess.run(["git", *identity, "-C", tmp_path, *arguments], check=True, capture_output=True)
+    os.utime(tmp_path / "a", (1e9, 1e9))
+    index = (tmp_path / ".git" / "index").read_bytes()
+    state = git_state(tmp_path)
+    assert state is not None
+    assert state["dirty"] is False
+    assert (tmp_path / ".git" / "index").read_bytes() == index
 
 
 @pytest.mark.parametrize("name", ["Übung 1", unicodedata.normalize("NFD", "Übung 1")])
