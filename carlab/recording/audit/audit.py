@@ -270,8 +270,9 @@ def _command_responses(
 ) -> dict[str, CommandResponse | None]:
     """Response of the motion to each command."""
     grid = grid_motion(channels.t_s, motion, channels.segment)
+    sent_s = channels.t_s - mapping.command_lag_s
     return {
-        channel: command_response(grid, channels.t_s, _sent_command(channels, channel, mapping), channel)
+        channel: command_response(grid, sent_s, _sent_command(channels, channel, mapping), channel)
         for channel in COMMAND_CHANNELS
     }
 
@@ -286,7 +287,7 @@ def _check_commands(
     findings = []
     is_long = grid_motion(channels.t_s, motion, channels.segment).rows.sum() >= MIN_ROWS
     for index, (channel, response) in enumerate(responses.items()):
-        command = _sent_command(channels, channel, mapping)
+        command = held_at(channels.t_s, _sent_command(channels, channel, mapping), -mapping.command_lag_s)
         effect = EFFECTS[channel]
         evidence = {} if response is None else _command_evidence(channel, channels.t_s, command, motion, response)
         if response is None or response.best < LIMITS.command_explained[index]:
