@@ -102,8 +102,7 @@ def diagnose(
         nominal: the simulator of the car file.
         uses: role of each recording, for the report.
         data_faults: faults that were found when the files were read; faults found here are added.
-        effects: candidate effects, the whole catalogue by default. Physics outside the catalogue withdraws no requested
-            effect.
+        effects: candidate effects, the whole catalogue by default. Physics outside it withdraws no requested effect.
         holdout_share: last share of each recording that is held out without ``held_out``; default: of the settings.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
