@@ -26,12 +26,6 @@ LATENCY = "mocap.latency"
 COMMAND_DELAY = "timing.command_delay"
 
 
-def observation_effects(effects: Iterable[str]) -> list[ObservationEffect]:
-    """The observation effects among ``effects`` (ids), in the order in which they act."""
-    found = [e for e in (EFFECTS[name] for name in effects) if isinstance(e, ObservationEffect)]
-    return sorted(found, key=lambda e: (e.order, e.id))
-
-
 def is_measurement_parameter(name: str) -> bool:
     """Whether a parameter belongs to the measurement: motion capture, or an observation effect."""
     table, _, rest = name.partition(".")
@@ -60,7 +54,8 @@ class MeasurementModel:
         self.velocity_time_constant_s: Value | None = None
         """Time constant of the filter on the velocities [s]; None without a filter."""
         self._static: list[tuple[ObservationEffect, Parameters]] = []
-        for effect in observation_effects(effects):
+        found = [e for e in (EFFECTS[name] for name in effects) if isinstance(e, ObservationEffect)]
+        for effect in sorted(found, key=lambda e: (e.order, e.id)):
             own = effect.numbers(values)
             if (latency_s := effect.latency_s(own)) is not None:
                 self.latency_s = latency_s

@@ -17,7 +17,7 @@ from sim_backends.array_ops import ARRAYS, Value
 from sim_backends.batch.inputs import Past, as_array, total_delays_s
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.advance import BODY_ROWS, Key, address, advance_blocks, segment_table, trace_step
+from sim_backends.compiled.advance import BODY_ROWS, Key, address, advance_rows, segment_table, trace_step
 from sim_backends.compiled.machine_code import FloatRow, SegmentTable, vector_length
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.single_track import SingleTrack
@@ -253,7 +253,8 @@ class _ArrayRollout:
             if bodies is not None and (k == 0 or bodies.shape[2] > 1):
                 starts = self._bodies_at_pieces(bodies[:, :, k % bodies.shape[2]])
                 table[:, SegmentTable.START] = np.stack([_addresses(rows) for rows in starts], axis=1).reshape(-1)
-            advance_blocks(key, (parameters[:, k], carried[:, k]), table)
+            inputs = np.concatenate([_addresses(rows[:, k]) for rows in (parameters, carried)])
+            advance_rows(key, inputs, carried[0, k], table)
             yield k, ends[:-1]
 
     def _table(

@@ -7,7 +7,7 @@ compiled to machine code: loops over segments and integration steps, and the der
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
@@ -160,25 +160,17 @@ def segment_table(
     return table
 
 
-def advance_rows(key: Key, rows: Sequence[FloatRow], table: NDArray[np.int64]) -> None:
+def advance_rows(key: Key, inputs: NDArray[np.integer[Any]], row: FloatRow, table: NDArray[np.int64]) -> None:
     """Advance cars through the segments of a table, and write the carried rows to the addresses of their ends.
 
     Args:
         key: Of the compiled function.
-        rows: Contiguous rows (cars,): the parameters of the graph, and the carried rows at the start.
+        inputs: Addresses of contiguous rows (cars,): the parameters of the graph, and the carried rows at the start.
+        row: One of these rows, which has their length and type.
         table: As of ``segment_table``.
     """
     if len(table):
-        inputs = addresses(rows)
-        compile_advance(key, rows[0].dtype).call(len(rows[0]), len(table), inputs.ctypes.data, table.ctypes.data)
-
-
-def advance_blocks(key: Key, blocks: tuple[FloatRow, FloatRow], table: NDArray[np.int64]) -> None:
-    """``advance_rows`` with blocks of contiguous rows: parameters (p, cars), and carried rows at the start."""
-    if len(table):
-        inputs = np.concatenate([address(rows) + rows.strides[0] * np.arange(len(rows)) for rows in blocks])
-        carried = blocks[1]
-        compile_advance(key, carried.dtype).call(carried.shape[1], len(table), inputs.ctypes.data, table.ctypes.data)
+        compile_advance(key, row.dtype).call(len(row), len(table), inputs.ctypes.data, table.ctypes.data)
 
 
 def advance_tensors(key: Key, steps: int, *inputs: Any) -> tuple[torch.Tensor, ...]:
@@ -210,7 +202,8 @@ class _Advance(torch.autograd.Function):
         cars, dtype = len(last), np.dtype(str(last.dtype).removeprefix("torch."))
         length = max(cars, vector_length(dtype))
         rows = [_as_row(value, length, dtype) for value in inputs]
-        parameters, (step, steering, throttle, t_s), carried = _cut(rows, len(graph.parameters))
+        count = len(graph.parameters)
+        parameters, (step, steering, throttle, t_s), carried = rows[:count], rows[count : count + 4], rows[count + 4 :]
         times = np.array([t_s + k * step for k in range(steps)])
         after = np.empty((steps, len(carried), length), dtype)
         numbers = np.arange(steps)
@@ -221,7 +214,7 @@ class _Advance(torch.autograd.Function):
             address(times) + times.strides[0] * numbers,
             (address(steering), address(throttle)),
         )
-        advance_rows(key, [*parameters, *carried], table)
+        advance_rows(key, addresses([*parameters, *carried]), carried[0], table)
         ctx.key, ctx.given, ctx.times = key, [*parameters, step, steering, throttle], times
         ctx.befores = [carried, *after[:-1]]
         return tuple(torch.from_numpy(row[:cars]) for row in after[-1])
@@ -245,8 +238,3 @@ class _Advance(torch.autograd.Function):
             adjoints = by_input[time_index + 1 :]
         found = zip([*sums, *adjoints], needed, strict=True)
         return (None, None, *(torch.from_numpy(gradient[:cars]) if need else None for gradient, need in found))
-
-
-def _cut(rows: list[FloatRow], parameters: int) -> tuple[list[FloatRow], list[FloatRow], list[FloatRow]]:
-    """Input rows as parameters, the four rows of a segment, and carried rows."""
-    return rows[:parameters], rows[parameters : parameters + 4], rows[parameters + 4 :]

@@ -203,7 +203,8 @@ class VectorWriter:
         sine = self.fma(self.mul(r, s), self._polynomial(SIN[self.bits], s), r)
         high = self._polynomial(COS[self.bits], s)
         cosine = self.fma(self.mul(s, s), high, self.fma(s, self.constant(-0.5), self.constant(1.0)))
-        odd = self._bit(integers, 0)
+        lowest = self.write(f"and {self._integers} {integers}, {self._integer(1)}")
+        odd = self.write(f"icmp ne {self._integers} {lowest}, {self._integer(0)}")
         sine_sign, cosine_sign = self._sign_bit(integers, 0), self._sign_bit(integers, 1)
         return [
             self._flipped(self.where(odd, cosine, sine), sine_sign),
@@ -212,10 +213,6 @@ class VectorWriter:
 
     def _integer(self, value: int) -> Name:
         return f"splat (i{self.bits} {value})"
-
-    def _bit(self, integers: Name, index: int) -> Name:
-        bit = self.write(f"and {self._integers} {integers}, {self._integer(1 << index)}")
-        return self.write(f"icmp ne {self._integers} {bit}, {self._integer(0)}")
 
     def _sign_bit(self, quadrants: Name, ahead: int) -> Name:
         """The second lowest bit of ``quadrants + ahead``, moved to the place of the sign."""

@@ -25,6 +25,7 @@ from sim_backends.compiled.advance import (
     segment_table,
     trace_step,
 )
+from sim_backends.compiled.machine_code import addresses
 from sim_backends.dynamics.integrate import rk4_step
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.dynamics.torch_ops import torch_ops
@@ -80,7 +81,7 @@ def by_compiled_step(rows: Rows) -> Step:
         step_row, ends = np.full_like(given[0], STEP_S), np.empty((6, len(given[0])), given[0].dtype)
         commands = address(given[6]), address(given[7])
         table = segment_table(np.array([address(ends)]), 1, address(step_row), address(step_row), commands)
-        advance_rows(key, [*(p.numpy() for p in parameters), *given[:6]], table)
+        advance_rows(key, addresses([*(p.numpy() for p in parameters), *given[:6]]), given[0], table)
         return tuple(map(torch.as_tensor, ends))
 
     return step
