@@ -57,29 +57,25 @@ def run_baselines(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str,
         ``failed`` with a sentence where the recording cannot be used.
     """
     with threadpool_limits(1):  # threads slow down small matrices
-        return _run_all(fit, hold, nominal, floor)
-
-
-def _run_all(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, float]) -> dict[str, Any]:
-    try:
-        data = prepare(fit, hold, nominal, floor)
-        system = System.of(data)
-    except (DataError, ValueError, ArithmeticError) as error:
-        return {"failed": str(error) or type(error).__name__}
-    results: dict[str, Any] = {}
-    methods: dict[str, Callable[[], Outcome]] = {
-        "refit only": lambda: (None, data.refit_score),
-        "PySINDy": lambda: _regressed(data, system, pysindy_regression(system)),
-        "GP residual": lambda: (None, min(gp_score(data), data.refit_score)),
-        "stepwise BIC": lambda: _regressed(data, system, stepwise_bic(system)),
-        "cross-correlation": lambda: (largest_correlation(data), None),
-    }
-    for name in BASELINES:
-        begin = time.perf_counter()
-        named, score = methods[name]()
-        seconds = round(time.perf_counter() - begin, 3)
-        results[name] = {"named": named, "score": score, "refit_score": data.refit_score, "seconds": seconds}
-    return results
+        try:
+            data = prepare(fit, hold, nominal, floor)
+            system = System.of(data)
+        except (DataError, ValueError, ArithmeticError) as error:
+            return {"failed": str(error) or type(error).__name__}
+        results: dict[str, Any] = {}
+        methods: dict[str, Callable[[], Outcome]] = {
+            "refit only": lambda: (None, data.refit_score),
+            "PySINDy": lambda: _regressed(data, system, pysindy_regression(system)),
+            "GP residual": lambda: (None, min(gp_score(data), data.refit_score)),
+            "stepwise BIC": lambda: _regressed(data, system, stepwise_bic(system)),
+            "cross-correlation": lambda: (largest_correlation(data), None),
+        }
+        for name in BASELINES:
+            begin = time.perf_counter()
+            named, score = methods[name]()
+            seconds = round(time.perf_counter() - begin, 3)
+            results[name] = {"named": named, "score": score, "refit_score": data.refit_score, "seconds": seconds}
+        return results
 
 
 def _regressed(data: Prepared, system: System, coefficients: FloatArray) -> Outcome:

@@ -24,6 +24,8 @@ from carlab.benchmark.world.simulation import FloatArray
 Term = Callable[[Steps], FloatArray]
 PATCHES = 8
 AT_END_ONLY = ("velocity_filter_lag",)
+OBSERVED_SIZE = 0.01
+"""Size of the effects of motion capture [m, rad, s]."""
 # Moderate sizes of changes of the commands for a 1:10 car.
 _SIZES = {
     "command_delay": 0.02, "steering_delay": 0.02, "throttle_delay": 0.02, "steering_lag": 0.04, "motor_lag": 0.05,
@@ -59,10 +61,10 @@ def library(data: Prepared) -> dict[str, Term]:
         "combined_slip": _spinning,
         "load_transfer": _grip(lambda s: _transfer(s, 0.05)),
         "aerodynamic_downforce": _grip(lambda s: (_pressed(s), _pressed(s))),
-        "marker_offset:ahead": _observed(lambda v, rate: np.stack([0 * v[:, 2], v[:, 2], 0 * v[:, 2]], axis=1), 0.01),
-        "marker_offset:left": _observed(lambda v, rate: np.stack([-v[:, 2], 0 * v[:, 2], 0 * v[:, 2]], axis=1), 0.01),
-        "mocap_yaw_misalignment": _observed(lambda v, rate: np.stack([v[:, 1], -v[:, 0], 0 * v[:, 0]], axis=1), 0.01),
-        "velocity_filter_lag": _observed(lambda v, rate: -rate, 0.01),
+        "marker_offset:ahead": _observed(lambda v, rate: np.stack([0 * v[:, 2], v[:, 2], 0 * v[:, 2]], axis=1)),
+        "marker_offset:left": _observed(lambda v, rate: np.stack([-v[:, 2], 0 * v[:, 2], 0 * v[:, 2]], axis=1)),
+        "mocap_yaw_misalignment": _observed(lambda v, rate: np.stack([v[:, 1], -v[:, 0], 0 * v[:, 0]], axis=1)),
+        "velocity_filter_lag": _observed(lambda v, rate: -rate),
     }  # fmt: skip
     for k, (x, y, radius) in enumerate(_places(data)):
         terms[f"low_friction_patch:{k}"] = _patch(x, y, radius)
@@ -122,14 +124,14 @@ def _grip(factors: Callable[[Steps], tuple[object, object]]) -> Term:
     return term
 
 
-def _observed(seen: Callable[[FloatArray, FloatArray], FloatArray], size: float) -> Term:
-    """Measured velocity v + size seen(v, rate), inverted at the start and applied at the end."""
+def _observed(seen: Callable[[FloatArray, FloatArray], FloatArray]) -> Term:
+    """Measured velocity v + OBSERVED_SIZE seen(v, rate), inverted at the start and applied at the end."""
 
     def term(s: Steps) -> FloatArray:
         starts = s.starts.copy()
-        starts[:, 3:] -= size * seen(s.starts[:, 3:], s.rates(at_end=False))
+        starts[:, 3:] -= OBSERVED_SIZE * seen(s.starts[:, 3:], s.rates(at_end=False))
         ends = s.rolled(starts=starts)
-        ends[:, 3:] += size * seen(s.ends[:, 3:], s.rates(at_end=True))
+        ends[:, 3:] += OBSERVED_SIZE * seen(s.ends[:, 3:], s.rates(at_end=True))
         return _gained(s, ends)
 
     return term

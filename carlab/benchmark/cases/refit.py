@@ -56,12 +56,16 @@ class Windows:
 
 @dataclass(frozen=True)
 class Refit:
-    """Fitted base parameters, and scores on the held-out windows (nominal and refitted)."""
+    """Fitted base parameters; on held-out windows, the nominal car's score and the fitted car's scores by channel."""
 
     values: dict[str, float]
     nominal_score: float
-    score: float
     channels: tuple[float, ...]
+
+    @property
+    def score(self) -> float:
+        """Root mean square of the scores of the channels."""
+        return _root_mean_square(np.array(self.channels))
 
     @property
     def excess(self) -> float:
@@ -127,16 +131,20 @@ def in_start_frame(errors: FloatArray, starts: FloatArray) -> FloatArray:
     return np.stack([*planar.to_body(errors[:, 0], errors[:, 1], starts[:, 2]), *errors[:, 2:].T], axis=1)
 
 
-def channel_scores(windows: Windows, values: Mapping[str, float], floor: FloatArray | None = None) -> FloatArray:
+def channel_scores(windows: Windows, values: Mapping[str, float]) -> FloatArray:
     """Root mean square over windows of every channel's error after the horizon, in noise floors, (6,)."""
     ends = roll(windows.car, values, windows.starts, windows.commands, windows.steps_s)
-    errors = in_start_frame(ends - windows.recorded, windows.starts) / (windows.floor if floor is None else floor)
+    errors = in_start_frame(ends - windows.recorded, windows.starts) / windows.floor
     return np.asarray(np.sqrt((errors**2).mean(axis=0)), dtype=np.float64)
 
 
-def score(windows: Windows, values: Mapping[str, float], floor: FloatArray | None = None) -> float:
-    """Root mean square over windows and channels of the error after the horizon, in noise floors (6,)."""
-    return float(np.sqrt((channel_scores(windows, values, floor) ** 2).mean()))
+def score(windows: Windows, values: Mapping[str, float]) -> float:
+    """Root mean square over windows and channels of the error after the horizon, in noise floors."""
+    return _root_mean_square(channel_scores(windows, values))
+
+
+def _root_mean_square(values: FloatArray) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def refit(fit: Windows, held_out: Windows, nominal: BaseCar, iterations: int = 10) -> Refit:
@@ -164,9 +172,8 @@ def refit(fit: Windows, held_out: Windows, nominal: BaseCar, iterations: int = 1
         else:
             damping *= 10
     values = dict(zip(names, (centre * np.exp(logs)).tolist(), strict=True))
-    channels = channel_scores(held_out, values)
-    total = float(np.sqrt((channels**2).mean()))
-    return Refit(values, score(held_out, nominal.free()), total, tuple(channels.tolist()))
+    channels = tuple(channel_scores(held_out, values).tolist())
+    return Refit(values, score(held_out, nominal.free()), channels)
 
 
 def _linearise(

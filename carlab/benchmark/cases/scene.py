@@ -20,7 +20,8 @@ from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, drive
 from carlab.core.errors import DataError
 
-STRENGTH_TOLERANCE = 0.10  # relative tolerance of the search for a strength
+MAX_TRIALS, STRENGTH_TOLERANCE = 8, 0.10
+"""Maximum number of trials and relative tolerance of the search for a strength."""
 MAX_RESEMBLANCE = 0.5
 """Random physics is drawn again if one effect of the catalogue explains a larger share of it. Other forms of an effect
 reach 0.88 to 1.0 with their own effect."""
@@ -34,7 +35,6 @@ class Concealed:
 
     form: Form
     parameters: dict[str, float]
-    size: float
     resemblance: Resemblance | None = None
 
 
@@ -95,7 +95,7 @@ class Scene:
         fitted = refit(windows[0], windows[1], self.nominal)
         return fitted, tuple(recordings), windows[1]
 
-    def sized(self, form: Form, target: float, tries: int = 8) -> tuple[Concealed, float]:
+    def sized(self, form: Form, target: float) -> tuple[Concealed, float]:
         """Scale the effect until its excess is ``target``, or as near as possible. Returns it and its excess.
 
         Raises:
@@ -104,8 +104,8 @@ class Scene:
         draw, resemblance = self._draw(form)
         low, high, best, best_miss, best_excess = 0.0, math.inf, None, math.inf, 0.0
         size, last = min(max(form.typical * target, form.smallest), form.largest), (0.0, 0.0)
-        for _ in range(tries):
-            candidate = Concealed(form, form.sized(size, draw), size, resemblance)
+        for _ in range(MAX_TRIALS):
+            candidate = Concealed(form, form.sized(size, draw), resemblance)
             try:
                 ratio = self.drive([candidate])[0].excess / target
             except DataError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -145,9 +144,9 @@ def soft_throttle_asymmetry(world: World, p: Parameters) -> None:
     world.throttle_maps.append(lambda u: u * (1.0 + 0.5 * change * (1.0 - math.tanh(u / 0.1))))
 
 
-def seeded(key: str) -> Callable[[float, Draw], dict[str, float]]:
-    """The size, and a seed for jitter."""
-    return lambda size, draw: {key: size, "seed": math.floor(1e6 * draw.shares[0])}
+def packet_parameters(size: float, draw: Draw) -> dict[str, float]:
+    """Mean delay [s], and a seed for jitter."""
+    return {"extra_delay": size, "seed": math.floor(1e6 * draw.shares[0])}
 
 
 def servo_parameters(size: float, draw: Draw) -> dict[str, float]:
@@ -156,7 +155,7 @@ def servo_parameters(size: float, draw: Draw) -> dict[str, float]:
 
 
 FORMS = (
-    Form("command_delay", "other", seeded("extra_delay"), packet_queue, 0.01, 0.15),
+    Form("command_delay", "other", packet_parameters, packet_queue, 0.01, 0.15),
     Form("steering_delay", "other", plain("delay"), polled(0), 0.01, 0.2),
     Form("throttle_delay", "other", plain("delay"), polled(1), 0.03, 0.4),
     Form("steering_lag", "other", servo_parameters, limited_servo, 0.01, 0.4),

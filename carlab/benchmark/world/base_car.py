@@ -6,8 +6,10 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tomli_w
@@ -15,8 +17,6 @@ import tomli_w
 Kind = Literal["dynamic", "linear_tyre", "kinematic", "blend"]
 GRAVITY_MPS2 = 9.81
 
-# Dotted names of the base parameters that a refit may change. Mass, axle distances, control period and command delay
-# are measured and fixed.
 FREE = {
     "vehicle.yaw_inertia": "yaw_inertia",
     "tyre.front.B": "b_front",
@@ -29,6 +29,22 @@ FREE = {
     "motor.damping": "damping",
     "steering.max_angle": "max_angle",
 }
+"""Base parameters that a refit may change, by dotted name; the others are measured and fixed."""
+FIELDS = {
+    "vehicle.mass": "mass",
+    "vehicle.yaw_inertia": "yaw_inertia",
+    "vehicle.front_axle": "front_axle",
+    "vehicle.rear_axle": "rear_axle",
+    **FREE,
+    "timing.control_period": "control_period",
+    "timing.command_delay": "command_delay",
+    "model.kind": "kind",
+    "mocap.rate": "mocap_rate",
+    "mocap.position_std": "position_std",
+    "mocap.yaw_std": "yaw_std",
+    "mocap.latency": "latency",
+}
+"""All parameters by dotted name, in the order of the car file."""
 
 
 @dataclass(frozen=True)
@@ -94,38 +110,17 @@ class BaseCar:
     @classmethod
     def read(cls, path: Path) -> BaseCar:
         """Read a file of ``write``."""
-        t = tomllib.loads(path.read_text())
-        front, rear = t["tyre"]["front"], t["tyre"]["rear"]
-        tyres = {"b_front": front["B"], "c_front": front["C"], "mu_front": front["mu"]}
-        tyres |= {"b_rear": rear["B"], "c_rear": rear["C"], "mu_rear": rear["mu"]}
-        mocap = {"mocap_rate" if k == "rate" else k: v for k, v in t["mocap"].items() if k != "dropout"}
-        return cls(**t["vehicle"], **tyres, **t["motor"], **t["steering"], **t["timing"], **t["model"], **mocap)
+        tables = tomllib.loads(path.read_text())
+        return cls(**{field: reduce(getitem, name.split("."), tables) for name, field in FIELDS.items()})  # type: ignore[arg-type]
 
-    def table(self) -> dict[str, dict[str, object]]:
+    def table(self) -> dict[str, Any]:
         """The car file as nested tables."""
-        return {
-            "vehicle": {
-                "mass": self.mass,
-                "yaw_inertia": self.yaw_inertia,
-                "front_axle": self.front_axle,
-                "rear_axle": self.rear_axle,
-            },
-            "tyre": {
-                "front": {"B": self.b_front, "C": self.c_front, "mu": self.mu_front},
-                "rear": {"B": self.b_rear, "C": self.c_rear, "mu": self.mu_rear},
-            },
-            "motor": {"drive_gain": self.drive_gain, "damping": self.damping},
-            "steering": {"max_angle": self.max_angle},
-            "timing": {"control_period": self.control_period, "command_delay": self.command_delay},
-            "model": {"kind": self.kind},
-            "mocap": {
-                "rate": self.mocap_rate,
-                "position_std": self.position_std,
-                "yaw_std": self.yaw_std,
-                "latency": self.latency,
-                "dropout": 0.0,
-            },
-        }
+        tables: dict[str, Any] = {}
+        for name, field in FIELDS.items():
+            *path, key = name.split(".")
+            reduce(lambda table, part: table.setdefault(part, {}), path, tables)[key] = getattr(self, field)
+        tables["mocap"]["dropout"] = 0.0
+        return tables
 
 
 def draw_nominal(rng: np.random.Generator, period_s: float = 1.0 / 30.0, kind: Kind = "dynamic") -> BaseCar:
