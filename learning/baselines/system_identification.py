@@ -11,7 +11,7 @@ from torch import Tensor
 from carlab.core.errors import DataError
 from learning.evaluation import Mixture
 from learning.outliers import log_student
-from learning.posterior.residuals import ResidualDistribution, fit_residuals
+from learning.posterior.residuals import PRIOR_ROWS, ResidualDistribution, fit_residuals
 from learning.priors.domain_models import DomainModel, draw_parameters
 
 N_SCREENED = 1024
@@ -23,8 +23,6 @@ N_REFINEMENTS, REFINEMENT_STEPS, REFINEMENT_RATE = 3, 150, 0.01
 """Alternations between the distribution of the errors and the parameters given it."""
 PRIOR_WIDTH_FACTOR = 4.0
 """Factor on the prior's standard deviation of each parameter in the penalty."""
-PRIOR_ROWS = 1.0
-"""Weight of the prior noise, in rows."""
 
 Losses = Callable[[Tensor], Tensor]
 """Losses (S,) at offsets (S, K)."""
@@ -118,7 +116,7 @@ class _Problem:
     def residuals_at(self, offset: Tensor) -> ResidualDistribution:
         """Distribution of the errors at one offset (K,)."""
         with torch.no_grad():
-            return fit_residuals(self.errors(offset[None])[0], self.noise_std, PRIOR_ROWS, self.fitted_rows)
+            return fit_residuals(self.errors(offset[None])[0], self.noise_std, self.fitted_rows)
 
 
 def identify(

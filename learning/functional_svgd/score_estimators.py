@@ -7,55 +7,28 @@ distributions give scores (B, m, d) in the reciprocal units of the draws.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from learning.priors.function_prior import JITTER, simulator_marginal
+ScoreEstimator = Callable[[Tensor, Tensor], Tensor]
+"""Scores (B, m, d) from draws (B, n, d), at points (B, m, d)."""
 
 
-class ScoreEstimator(Protocol):
-    """An estimator of scores from draws."""
-
-    def __call__(self, draws: Tensor, points: Tensor) -> Tensor:
-        """Scores (B, m, d) at points (B, m, d) from draws (B, n, d)."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class GaussianFit:
-    """Score of the Gaussian with the moments of the draws: the estimator of the paper.
-
-    Attributes:
-        jitter: variance added to each coordinate.
-    """
-
-    jitter: float = JITTER
-
-    def __call__(self, draws: Tensor, points: Tensor) -> Tensor:
-        """Scores (B, m, d); as in the protocol."""
-        by_output, values = draws.permute(1, 2, 0), points.permute(1, 2, 0)
-        return simulator_marginal(by_output, by_output[0], None, self.jitter).score(values).permute(2, 0, 1)
-
-
-@dataclass(frozen=True, slots=True)
-class KernelDensity:
-    """Score of a kernel density estimate with a Gaussian kernel.
+def kernel_density(draws: Tensor, points: Tensor) -> Tensor:
+    """Scores (B, m, d) of a kernel density estimate with a Gaussian kernel.
 
     The kernel's standard deviation in each coordinate is that of the draws times ``n^(-1 / (d + 4))`` (Scott 1992,
     "Multivariate Density Estimation", Scott's rule).
     """
-
-    def __call__(self, draws: Tensor, points: Tensor) -> Tensor:
-        """Scores (B, m, d); as in the protocol."""
-        count, width = draws.shape[1:]
-        bandwidth = draws.std(dim=1, keepdim=True) * count ** (-1.0 / (width + 4))
-        scaled_draws, scaled_points = draws / bandwidth, points / bandwidth
-        weights = torch.softmax(-0.5 * squared_distances(scaled_points, scaled_draws), dim=2)
-        score: Tensor = (weights @ scaled_draws - scaled_points) / bandwidth
-        return score
+    count, width = draws.shape[1:]
+    bandwidth = draws.std(dim=1, keepdim=True) * count ** (-1.0 / (width + 4))
+    scaled_draws, scaled_points = draws / bandwidth, points / bandwidth
+    weights = torch.softmax(-0.5 * squared_distances(scaled_points, scaled_draws), dim=2)
+    score: Tensor = (weights @ scaled_draws - scaled_points) / bandwidth
+    return score
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +50,7 @@ class SpectralStein:
     from_normal: bool = False
 
     def __call__(self, draws: Tensor, points: Tensor) -> Tensor:
-        """Scores (B, m, d); as in the protocol."""
+        """Scores (B, m, d) from draws (B, n, d), at points (B, m, d)."""
         given, draws, points = points, draws.double(), points.double()
         variance = median_distance(draws) ** 2
         kernel = torch.exp(-0.5 * squared_distances(draws, draws) / variance)
@@ -117,7 +90,7 @@ class NuMethod:
     from_normal: bool = False
 
     def __call__(self, draws: Tensor, points: Tensor) -> Tensor:
-        """Scores (B, m, d); as in the protocol."""
+        """Scores (B, m, d) from draws (B, n, d), at points (B, m, d)."""
         scale = self.width * median_distance(draws)
         draws, points = draws / scale, points / scale
         at_draws, at_points = CurlFreeImq(draws, draws), CurlFreeImq(points, draws)

@@ -40,11 +40,6 @@ class Adam:
         self.mean, self.square = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
         self._steps = torch.zeros((), device=self.parameters.device)
 
-    @property
-    def steps(self) -> int:
-        """Number of steps done."""
-        return int(self._steps)
-
     def step(self, gradient: Tensor, rate: float | Tensor) -> None:
         """Move the parameters against their gradient, a tensor of the same shape, by the learning rate ``rate``.
 
@@ -59,7 +54,7 @@ class Adam:
 
     def state(self) -> dict[str, Tensor | int]:
         """Number of steps, and a copy of both moments in the shape of the parameters, on the CPU."""
-        return {"steps": self.steps, "mean": self.mean.cpu().clone(), "square": self.square.cpu().clone()}
+        return {"steps": int(self._steps), "mean": self.mean.cpu().clone(), "square": self.square.cpu().clone()}
 
     def load(self, state: dict[str, Tensor | int]) -> None:
         """Load the moments of ``state``. Raises ValueError for another shape."""

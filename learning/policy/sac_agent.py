@@ -170,8 +170,7 @@ class SacAgent:
             observation_size: number of features; not below the current one.
         """
         assert self._sac is not None
-        (width,) = self._sac.observation_space.shape or (0,)
-        if observation_size <= width:
+        if observation_size <= self.observation_size:
             return
         wider = _without_environment(observation_size, self._settings, self._seed)
         state, wider_state = self._sac.learned_state(), wider.learned_state()

@@ -26,8 +26,7 @@ from learning.networks.adam import Adam, half_cosine
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.function_posterior import JITTER, FunctionPosterior
-from learning.posterior.particle_posterior import ParticlePosterior, input_clip_of
-from learning.posterior.particle_simulator import ParticleSimulator
+from learning.posterior.particle_posterior import ParticlePosterior, ParticleSimulator, input_clip_of
 from learning.priors.domain_models import DomainModel
 from learning.priors.simulator_model import CarModel
 from learning.stein import moment_direction

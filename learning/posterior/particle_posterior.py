@@ -12,12 +12,38 @@ from learning.evaluation import Mixture
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.outliers import tail_scales
-from learning.posterior.particle_simulator import ParticleSimulator
+from learning.priors.simulator_model import CarModel
 
 MIN_INPUT_CLIP = 6.0
 """Minimum clip of normalised inputs; a network's extrapolation is unbounded."""
 MAX_SIMULATED = 30.0
 """Bound of a simulator's outputs, in units of the outputs: a draw may diverge far from the rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleSimulator:
+    """A simulator with L draws of its parameters, whose steps the networks of the particles correct.
+
+    Attributes:
+        model: the simulator.
+        parameters: one draw for each particle (L, K).
+    """
+
+    model: CarModel
+    parameters: Tensor
+
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """Raw outputs (L, N, O) at raw inputs (N, D) or at raw inputs of each particle (L, N, D); without a gradient.
+
+        Outputs that are not finite are zero.
+        """
+        by_particle = inputs if inputs.ndim == 3 else inputs.expand(len(self.parameters), *inputs.shape)
+        with torch.no_grad():
+            return self.model.steps_of_draws(by_particle, self.parameters).nan_to_num(0.0, 0.0, 0.0)
+
+    def to(self, device: torch.device | str) -> ParticleSimulator:
+        """Copy on a device."""
+        return ParticleSimulator(self.model, self.parameters.to(device))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,8 @@ from learning.outliers import DOF_CANDIDATES, log_student, mahalanobis_sq, maxim
 SCALE_ITERATIONS = 60
 """Iterations of the expectation maximisation of the common scale."""
 MIN_DOF = DOF_CANDIDATES[0]
+PRIOR_ROWS = 1.0
+"""Weight of a prior standard deviation of the errors, in rows."""
 MIN_SCALE, MIN_SHARE = 1e-9, 1e-3
 """Lower bounds of an output's error (absolute, and relative to its root mean square), for constant outputs."""
 
@@ -62,9 +64,7 @@ class ResidualDistribution:
         return ResidualDistribution(self.factor.to(like), self.dof)
 
 
-def fit_residuals(
-    errors: Tensor, prior_std: Tensor | None = None, prior_rows: float = 1.0, fitted_rows: float = 0.0
-) -> ResidualDistribution:
+def fit_residuals(errors: Tensor, prior_std: Tensor | None = None, fitted_rows: float = 0.0) -> ResidualDistribution:
     """Fit a Student-t distribution to residuals by maximum likelihood.
 
     Correlation and relative scales are those of ``outliers.output_correlation``; the common scale and the degrees of
@@ -74,8 +74,7 @@ def fit_residuals(
 
     Args:
         errors: (n, O).
-        prior_std: prior standard deviation (O,), positive; None: no prior.
-        prior_rows: its weight in rows.
+        prior_std: prior standard deviation (O,), positive, worth ``PRIOR_ROWS`` rows; None: no prior.
         fitted_rows: degrees of freedom used by the fit of the mean, in rows: its parameters divided by the outputs.
 
     Raises:
@@ -85,7 +84,7 @@ def fit_residuals(
     if not count or not torch.isfinite(errors).all():
         raise DataError("The residuals are empty or not finite; check the inputs of the model.")
     errors = errors.double()
-    weight = 0.0 if prior_std is None else prior_rows
+    weight = 0.0 if prior_std is None else PRIOR_ROWS
     unit = errors.square().mean(dim=0).sqrt() if prior_std is None else prior_std.double()
     unit = unit.clamp_min(MIN_SCALE)
     correlation, scales = output_correlation(errors / unit)

@@ -115,11 +115,10 @@ class Pendulum:
     """Change of (sin, cos, rate) of a pendulum over 50 ms: ``theta'' = (g/l) sin theta + u / (m l^2) - friction``.
 
     Explicit Euler in ten substeps, as in the authors' code. Friction is ``nu rate / (m l) + drag / m rate^2`` as in
-    their code (its square does not change sign with the rate) or, with ``dissipative``, ``rate |rate|``.
+    their code; its square does not change sign with the rate.
 
     Attributes:
         masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu [N s] and drag [kg].
-        dissipative: whether the drag always brakes.
         rate_discrepancy: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing
             angular acceleration: a discrepancy process inside the dynamics, with a polynomial kernel.
         hidden_acceleration: further angular acceleration of a true system; None: zero.
@@ -133,7 +132,6 @@ class Pendulum:
     gravities: Range = (5.0, 15.0)
     frictions: Range = (0.0, 0.0)
     drags: Range = (0.0, 0.0)
-    dissipative: bool = False
     rate_discrepancy: tuple[float, float, float] = (0.0, 0.0, 0.0)
     hidden_acceleration: HiddenAcceleration | None = None
     period_s: float = 0.05
@@ -158,8 +156,7 @@ class Pendulum:
         step, inertia = self.period_s / self.substeps, mass * length**2
         theta, omega = angle.expand(len(parameters), -1), rate.expand(len(parameters), -1)
         for _ in range(self.substeps):
-            square = omega * omega.abs() if self.dissipative else omega * omega
-            resistance = friction * omega / (mass * length) + drag / mass * square
+            resistance = friction * omega / (mass * length) + drag / mass * (omega * omega)
             missing = (linear + odd * omega.abs() + even * omega) * omega
             acceleration = gravity / length * torch.sin(theta) + torque / inertia - resistance + missing
             if self.hidden_acceleration is not None:

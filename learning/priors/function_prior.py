@@ -41,15 +41,6 @@ class Marginal:
         white: Tensor = torch.linalg.solve_triangular(self.factor, deviation, upper=False)
         return white
 
-    def log_density(self, values: Tensor) -> Tensor:
-        """Log density (L,) of values (L, N, O)."""
-        white = self.whitened(values)
-        count = white.shape[0] * white.shape[1]
-        half_log = self.factor.diagonal(dim1=1, dim2=2).log().sum()
-        log_two_pi = torch.log(torch.tensor(2.0 * torch.pi)).item()
-        density: Tensor = -0.5 * (white * white).sum(dim=(0, 1)) - half_log - 0.5 * count * log_two_pi
-        return density
-
 
 @dataclass(frozen=True, slots=True)
 class RbfCovariance:

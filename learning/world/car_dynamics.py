@@ -7,7 +7,6 @@ noise of the likelihood (aleatoric uncertainty).
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass, field
 
 import torch
@@ -23,22 +22,8 @@ from learning.rollouts import StatelessModel
 from learning.transitions import transitions_of
 
 
-class StepInBody(StatelessModel):
-    """A step by exact kinematics, from changes sampled in the body frame at its start."""
-
-    __slots__ = ()
-
-    @abstractmethod
-    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
-
-    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
-        return advance(features, action, self.sample(inputs_of(features, action), generator))
-
-
 @dataclass(frozen=True, slots=True)
-class CarDynamics(StepInBody):
+class CarDynamics(StatelessModel):
     """A fitted model of one step of a car.
 
     Attributes:
@@ -61,6 +46,10 @@ class CarDynamics(StepInBody):
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """One sample (N, 6) of the mixture for each row of inputs (N, 3 + 2 (H + 1))."""
         return self.sampler(inputs, generator)
+
+    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
+        return advance(features, action, self.sample(inputs_of(features, action), generator))
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps [nat per step], and calibration error.

@@ -29,8 +29,7 @@ from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
 from learning.posterior.inference import infer
-from learning.posterior.particle_posterior import ParticlePosterior
-from learning.posterior.particle_simulator import ParticleSimulator
+from learning.posterior.particle_posterior import ParticlePosterior, ParticleSimulator
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, draw_parameters
 from learning.priors.simulator_model import CarModel
 from learning.priors.simulator_text import model_of, text_of

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from learning.posterior.particle_simulator import ParticleSimulator
+from learning.posterior.particle_posterior import ParticleSimulator
 from learning.world.drive_windows import DriveWindows
 
 DEVIATION_UNITS = (0.3, 0.25, 1.0)

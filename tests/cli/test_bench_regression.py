@@ -16,7 +16,7 @@ from carlab.studies.regression.scores import summarised
 from carlab.studies.regression.study import run_study
 from learning.baselines.ridge import Ridge
 from learning.functional_svgd.fsvgd import fit_fsvgd
-from learning.functional_svgd.score_estimators import KernelDensity, NuMethod, SpectralStein
+from learning.functional_svgd.score_estimators import NuMethod, SpectralStein, kernel_density
 from learning.posterior.residuals import fit_residuals
 from learning.priors.domain_models import draw_parameters
 
@@ -204,7 +204,8 @@ def test_variants_change_only_the_prior_of_sim_fsvgd(fits):
     (published, settings), *variants = fits
     assert all(used == settings for _, used in variants)
     *estimated, (exact, _) = variants
-    assert [type(prior.estimator) for prior, _ in estimated] == [KernelDensity, SpectralStein, NuMethod]
+    expected = [kernel_density, SpectralStein(from_normal=True), NuMethod(from_normal=True)]
+    assert [prior.estimator for prior, _ in estimated] == expected
     for prior in (exact, *(prior.prior for prior, _ in estimated)):
         assert torch.equal(prior.draws, published.draws)
     assert [prior.prior.discrepancy for prior, _ in estimated] == [published.discrepancy] * 3

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
-from learning.posterior.particle_posterior import ParticlePosterior
-from learning.posterior.particle_simulator import ParticleSimulator
+from learning.posterior.particle_posterior import ParticlePosterior, ParticleSimulator
 from learning.priors.simulator_model import CarModel
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics

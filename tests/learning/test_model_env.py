@@ -16,8 +16,8 @@ from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafetyEnvelope, limit
 from carlab.core.task import ParkingTask
 from learning.policy.sac import FastSac
-from learning.world.car_dynamics import StepInBody
 from learning.world.model_env import REWARD_SCALE, ModelEnv, policy_inputs
+from tests.helpers.step_in_body import StepInBody
 
 HISTORY = 2
 WIDTH = 7 + 2 * HISTORY

@@ -81,7 +81,7 @@ def test_quadratic_drag_without_sign_can_add_energy():
     """The drag of the authors' code adds energy to a pendulum that rotates backwards."""
     fine = {"substeps": 200, "drags": (0.4, 0.6)}
     assert float(energies(Pendulum(**fine), 1, steps=2).diff(dim=0).max()) > 0.1
-    assert float(energies(Pendulum(**fine, dissipative=True), 1, steps=2).diff(dim=0).max()) < 0.02
+    assert float(energies(Pendulum(substeps=200), 1, steps=2).diff(dim=0).max()) < 0.02
 
 
 @pytest.mark.parametrize("lag", [0.02, 0.06])

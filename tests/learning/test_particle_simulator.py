@@ -16,8 +16,7 @@ from learning.networks.particles import Network
 from learning.posterior.distillation import DistillationSettings, distil
 from learning.posterior.function_posterior import FunctionPosterior, simulate
 from learning.posterior.inference import infer
-from learning.posterior.particle_posterior import MAX_SIMULATED, ParticlePosterior
-from learning.posterior.particle_simulator import ParticleSimulator
+from learning.posterior.particle_posterior import MAX_SIMULATED, ParticlePosterior, ParticleSimulator
 from learning.posterior.sampler import Assignment, PosteriorSampler
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import CarModel

@@ -58,12 +58,10 @@ def test_fit_loses_little_held_out_density_against_the_truth(rows):
 def test_few_rows_keep_the_prior_scale():
     """Two rows with zero residuals keep the expected noise, with heavy tails."""
     zero_residuals = torch.zeros((2, 3)).double()
-    found = fit_residuals(zero_residuals, torch.tensor([0.1, 0.2, 0.3]), 1.0)
+    found = fit_residuals(zero_residuals, torch.tensor([0.1, 0.2, 0.3]))
     assert 2.5 <= found.dof <= 3.0
     assert found.scale.numpy() == pytest.approx(np.array([0.1, 0.2, 0.3]) / math.sqrt(3.0), rel=0.35)
-    assert (
-        fit_residuals(zero_residuals, torch.tensor([0.1, 0.2, 0.3]), 1.0, fitted_rows=1.0).scale > found.scale
-    ).all()
+    assert (fit_residuals(zero_residuals, torch.tensor([0.1, 0.2, 0.3]), fitted_rows=1.0).scale > found.scale).all()
 
 
 def test_empty_and_nan_residuals_are_refused():

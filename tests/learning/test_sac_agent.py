@@ -17,8 +17,8 @@ from carlab.core.policy import Policy, PolicyInput
 from carlab.core.quantities import CarState, Observation
 from carlab.core.task import ParkingTask
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacPolicy, SacSettings
-from learning.world.car_dynamics import StepInBody
 from learning.world.model_env import ModelEnv, policy_inputs
+from tests.helpers.step_in_body import StepInBody
 
 HISTORY = 1
 SETTINGS = SacSettings(hidden=(32,), cars=32, warm_up=512, batch=128, discount=0.5, learning_rate=3e-3, temperature=0.3)

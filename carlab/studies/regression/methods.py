@@ -23,7 +23,7 @@ from learning.baselines.system_identification import GreyBox, IdentifiedSimulato
 from learning.evaluation import Mixture, Predictor
 from learning.functional_svgd.estimated_prior import EstimatedPrior
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit_fsvgd
-from learning.functional_svgd.score_estimators import KernelDensity, NuMethod, ScoreEstimator, SpectralStein
+from learning.functional_svgd.score_estimators import NuMethod, ScoreEstimator, SpectralStein, kernel_density
 from learning.networks.normaliser import Normaliser
 from learning.posterior.averaging import average
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
@@ -84,14 +84,6 @@ class FitTask:
     def noise_std(self) -> Tensor:
         """Prior noise (O,), on the data's device."""
         return torch.tensor(self.case.prior_noise_std).to(self.data.inputs.device)
-
-    def network_settings(self) -> FsvgdSettings:
-        """Settings of the ensemble's networks."""
-        case = self.case
-        noise = tuple(s / o for s, o in zip(case.prior_noise_std, case.output_std, strict=True))
-        return FsvgdSettings(
-            steps=self.steps or STEPS, noise_std=noise, fit_noise=case.fit_noise, noise_rows=NOISE_ROWS, seed=self.seed
-        )
 
     def authors_settings(self, *, with_simulator: bool, corrected: bool) -> FsvgdSettings:
         """The authors' settings of functional SVGD."""
@@ -216,7 +208,12 @@ class FitTask:
 
     def ensemble(self) -> Predictor:
         """Deep ensemble."""
-        return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, self.network_settings())
+        case = self.case
+        noise = tuple(s / o for s, o in zip(case.prior_noise_std, case.output_std, strict=True))
+        settings = FsvgdSettings(
+            steps=self.steps or STEPS, noise_std=noise, fit_noise=case.fit_noise, noise_rows=NOISE_ROWS, seed=self.seed
+        )
+        return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, settings)
 
     def ridge(self) -> Predictor:
         """Ridge regression."""
@@ -239,7 +236,7 @@ METHODS: dict[str, Callable[[FitTask], Predictor]] = {
 }
 """Methods by their name in tables and on the command line; ``sim-posterior`` has no model discrepancy."""
 VARIANTS: dict[str, Callable[[FitTask], Predictor]] = {
-    "sim-fsvgd-kde": lambda task: task.sim_fsvgd(estimator=KernelDensity()),
+    "sim-fsvgd-kde": lambda task: task.sim_fsvgd(estimator=kernel_density),
     "sim-fsvgd-ssge": lambda task: task.sim_fsvgd(estimator=SpectralStein(from_normal=True)),
     "sim-fsvgd-nu": lambda task: task.sim_fsvgd(estimator=NuMethod(from_normal=True)),
     "sim-fsvgd-no-discrepancy": lambda task: task.sim_fsvgd(with_discrepancy=False),
