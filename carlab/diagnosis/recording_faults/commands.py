@@ -13,6 +13,7 @@ import numpy as np
 
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
 from carlab.recording.column_mapping import COMMAND_CHANNELS
+from carlab.recording.faults.clock_offset import clock_offset
 from carlab.recording.faults.command_clock import WINDOW_S, WindowLags, clock_rate, window_lags
 from carlab.recording.faults.commands import (
     LAGS_S,
@@ -60,7 +61,7 @@ def check_yaw_direction(repairs: Sequence[EpisodeRepair]) -> None:
 def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -> None:
     """Check and repair the command columns of all recordings; a common fault needs less evidence in each of them."""
     expected_s = nominal.command_delay_s + nominal.mocap.latency_s
-    motions = [grid_motion(repair.times_s, repair.motion(), repair.segment) for repair in repairs]
+    motions = [_correct_clock_offset(repair, expected_s) for repair in repairs]
     pairs = list(zip(repairs, motions, strict=True))
     by_recording = [_responses(repair, motion) for repair, motion in pairs]
     is_restamped = _check_clock(repairs, motions, by_recording)
@@ -74,6 +75,22 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
         if clear:
             _check_sign(repairs, clear, channel)
             _check_shift(repairs, responses, channel, expected_s)
+
+
+def _correct_clock_offset(repair: EpisodeRepair, expected_s: float) -> GridMotion:
+    """Shift both commands to the delay of the car file if their clock differs by seconds. Returns the motion."""
+    motion = grid_motion(repair.times_s, repair.motion(), repair.segment)
+    fault = clock_offset(motion, repair.times_s, list(repair.commands.T))
+    if fault is None:
+        return motion
+    rows = round((expected_s - fault.evidence["delay_s"]) / repair.period_s)
+    late_s = rows * repair.period_s
+    for channel in range(len(COMMAND_CHANNELS)):
+        repair.retime(channel, -late_s)
+    repair.trim(abs(rows) + 1, at_end=rows > 0)
+    earlier = f"{abs(late_s):.2f} s {'earlier' if rows > 0 else 'later'}"
+    repair.repaired(fault, f"the commands were stamped {earlier}; set the clocks of both computers by NTP or PTP")
+    return grid_motion(repair.times_s, repair.motion(), repair.segment)
 
 
 def _responses(repair: EpisodeRepair, motion: GridMotion) -> list[CommandResponse | None]:

@@ -15,7 +15,15 @@ from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit import file_checks
 from carlab.recording.audit.report import Finding, Severity
-from carlab.recording.column_mapping import COMMAND_CHANNELS, VELOCITY_CHANNELS, ColumnMapping, ColumnSource
+from carlab.recording.column_mapping import (
+    COMMAND_CHANNELS,
+    MAX_LAG_S,
+    MAX_LAG_SHARE,
+    VELOCITY_CHANNELS,
+    ColumnMapping,
+    ColumnSource,
+)
+from carlab.recording.faults.clock_offset import clock_offset
 from carlab.recording.faults.commands import (
     MIN_ROWS,
     CommandResponse,
@@ -152,6 +160,16 @@ def _sign_finding(fault: Fault, mapping: ColumnMapping) -> Finding:
     return Finding.of_fault(fault, remedy=remedy)
 
 
+def _clock_finding(fault: Fault, t_s: FloatArray, mapping: ColumnMapping) -> Finding:
+    """The fault of commands with another clock. Only a short offset can be corrected in the joined file."""
+    lag_s = round(mapping.command_lag_s + LIMITS.command_delay_s - fault.evidence["delay_s"], 2)
+    if abs(lag_s) <= min(MAX_LAG_S, MAX_LAG_SHARE * float(t_s[-1] - t_s[0])):
+        fault = replace(fault, option=f"--command-lag {lag_s:g}")
+        return Finding.of_fault(fault, remedy=f"use {fault.option}")
+    change = f"{'subtract' if lag_s > 0 else 'add'} {abs(lag_s):g} s {'from' if lag_s > 0 else 'to'}"
+    return Finding.of_fault(fault, remedy=f"{change} the stamps of the commands, and join them with the poses again")
+
+
 def _check_velocities(
     channels: Channels, motion: PoseMotion, mapping: ColumnMapping
 ) -> tuple[list[Finding], BoolArray]:
@@ -283,9 +301,14 @@ def _check_commands(
     responses: Mapping[str, CommandResponse | None],
     mapping: ColumnMapping,
 ) -> list[Finding]:
-    """Sign and delay of both commands by their effect on the motion."""
+    """Clock, sign and delay of both commands by their effect on the motion."""
     findings = []
-    is_long = grid_motion(channels.t_s, motion, channels.segment).rows.sum() >= MIN_ROWS
+    grid = grid_motion(channels.t_s, motion, channels.segment)
+    sent = [_sent_command(channels, channel, mapping) for channel in COMMAND_CHANNELS]
+    offset = clock_offset(grid, channels.t_s - mapping.command_lag_s, sent)
+    if offset is not None:  # with another clock, sign and delay mean nothing
+        return [_clock_finding(offset, channels.t_s, mapping)]
+    is_long = grid.rows.sum() >= MIN_ROWS
     for index, (channel, response) in enumerate(responses.items()):
         command = held_at(channels.t_s, _sent_command(channels, channel, mapping), -mapping.command_lag_s)
         effect = EFFECTS[channel]

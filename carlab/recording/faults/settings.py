@@ -90,5 +90,20 @@ class FaultSettings:
     constant_command: float = 0.02
     """Standard deviation of a command (full command = 1) below which it shows no effect."""
 
+    offset_range_s: float = 10.0
+    """[s] Largest searched offset between the clocks of commands and poses. Larger ones are errors of a date."""
+    offset_range_share: float = 1.0 / 3.0
+    """Largest searched offset as a share of the recording, so that two thirds of the rows can be compared."""
+    offset_unexplained_ratio: float = 1.5
+    """Unexplained variance at each other lag over that at the clock offset. Multiples of a period reach 1.30."""
+    offset_log_likelihood: float = 12.0
+    """[nat] Log-likelihood that the offset gains over each other lag. Commands of another recording reach 10.8."""
+    offset_peak_s: float = 2.0
+    """[s] Largest width at half height of the peak at an offset. Servo and motor make 1.5 s; commands that change every
+    few seconds make more, and their peak lies anywhere in it."""
+    command_delay_s: float = 0.1
+    """[s] Delay with servo or motor that a proposed correction leaves; the recording does not separate it from the
+    offset."""
+
 
 LIMITS = FaultSettings()

@@ -1,0 +1,108 @@
+"""Commands whose clock differs by seconds from that of the poses: correlation with the motion over many lags.
+
+Yaw rate follows steering times speed, and forward acceleration follows throttle. The unexplained variance of both is
+compared at all lags. A clock offset makes one lag outside ``LAGS_S`` better than all others; a periodic drive makes
+several lags equally good, and slow commands make a broad range of lags good. Both show no offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from carlab.core.quantities import FloatArray
+from carlab.recording.column_mapping import COMMAND_CHANNELS
+from carlab.recording.faults.commands import LAGS_S, MIN_ROWS, GridMotion, command_response
+from carlab.recording.faults.fault import Fault
+from carlab.recording.faults.robust import first_order_lag, held_means
+from carlab.recording.faults.settings import LIMITS
+
+TIME_CONSTANT_S = 0.1
+"""[s] First-order lag of the response in the search; the fit at the found lag has its own."""
+MIN_POWER_SHARE = 0.25
+"""A lag counts fully if its overlap has this share of the largest power; few or constant rows correlate by chance."""
+
+
+def clock_offset(motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatArray]) -> Fault | None:
+    """The fault of both commands (N,), held from each of ``t_s`` (N,) on, if their clock differs by seconds.
+
+    Its evidence has ``delay_s``, the delay of the motion in the recording [s], and ``unexplained_ratio``.
+    """
+    if motion.rows.sum() < MIN_ROWS:
+        return None
+    information = np.zeros(1)  # mutual information of Gaussian variables [2 nats]
+    for channel, command in zip(COMMAND_CHANNELS, commands, strict=True):
+        if np.std(command) >= LIMITS.constant_command:
+            correlation = np.clip(_lag_correlation(motion, t_s, command, channel), 0.0, 0.999)
+            information = information - np.log1p(-(correlation**2))
+    if len(information) == 1:
+        return None
+    lags_s = motion.period_s * np.arange(-(len(information) // 2), len(information) // 2 + 1, dtype=np.float64)
+    lag_s, ratio = _distinct_peak(lags_s, information, float(motion.rows.sum() * motion.period_s))
+    if LAGS_S[0] <= lag_s <= LAGS_S[-1] or ratio < LIMITS.offset_unexplained_ratio:
+        return None
+    delays_s = []
+    for channel, command, min_share in zip(COMMAND_CHANNELS, commands, LIMITS.command_explained, strict=True):
+        response = command_response(motion, t_s + lag_s, command, channel)
+        if response is not None and response.best >= min_share and response.gain > 0 and response.is_lag_inside:
+            delays_s.append(lag_s + response.lag_s + response.time_constant_s)
+    if not delays_s:
+        return None
+    delay_s = float(np.mean(delays_s))
+    observation = (
+        f"the motion {'precedes' if delay_s < 0 else 'follows'} the commands by {abs(delay_s):.2f} s: commands and "
+        "poses have different clocks"
+    )
+    evidence = {"delay_s": delay_s, "unexplained_ratio": ratio}
+    return Fault("clock_offset", ", ".join(COMMAND_CHANNELS), observation, evidence)
+
+
+def _lag_correlation(motion: GridMotion, t_s: FloatArray, command: FloatArray, channel: str) -> FloatArray:
+    """Correlation (2 n + 1,) of the motion with a command (N,) at lags of -n to n rows, half of the recording."""
+    is_steering = channel == "steering"
+    vx, rate = motion.vx, motion.yaw_rate
+    columns = [np.ones_like(vx), vx, vx * np.abs(vx)]
+    if not is_steering:
+        columns += [rate**2, np.abs(rate), np.abs(rate * vx)]
+    base = np.linalg.qr(np.column_stack(columns)[motion.rows])[0]
+    values = (rate if is_steering else motion.acceleration)[motion.rows]
+    target = np.zeros(len(vx))
+    target[motion.rows] = values - base @ (base.T @ values)
+    factor: FloatArray = np.where(motion.rows, vx if is_steering else 1.0, 0.0).astype(np.float64)
+    held = held_means(t_s, command, motion.t_s - 0.5 * motion.period_s, motion.period_s)
+    filtered = first_order_lag(held, motion.period_s, TIME_CONSTANT_S)
+    filtered = filtered - filtered.mean()
+    target_power = _lag_products(target**2, np.ones(len(vx)))
+    command_power = _lag_products(factor**2, filtered**2)
+    power = np.maximum(target_power, MIN_POWER_SHARE * target_power.max()) * np.maximum(
+        command_power, MIN_POWER_SHARE * command_power.max()
+    )
+    return np.asarray(_lag_products(target * factor, filtered) / np.sqrt(power + 1e-18))
+
+
+def _lag_products(values: FloatArray, delayed: FloatArray) -> FloatArray:
+    """Sums (2 n + 1,) of values (N,) times ``delayed`` (N,) at lags of -n to n rows, where n is N // 2."""
+    middle, n = len(values) - 1, len(values) // 2
+    return np.asarray(fftconvolve(values, delayed[::-1])[middle - n : middle + n + 1])
+
+
+def _distinct_peak(lags_s: FloatArray, information: FloatArray, moving_s: float) -> tuple[float, float]:
+    """Lag of the peak [s], and the least ratio of the unexplained variance elsewhere over that at the peak.
+
+    The ratio is 0 for a peak at the edge of the search, for a broad peak, and for one that is not significant. The
+    log-likelihood counts one independent sample for each width of the peak in ``moving_s`` of motion.
+    """
+    range_s = min(LIMITS.offset_range_s, LIMITS.offset_range_share * float(np.ptp(lags_s)))
+    searched = np.flatnonzero(np.abs(lags_s) <= range_s)
+    peak = int(searched[np.argmax(information[searched])])
+    low = np.flatnonzero(information < 0.5 * information[peak])
+    before, after = low[low < peak], low[low > peak]
+    if peak in (searched[0], searched[-1]) or not len(before) or not len(after):
+        return float(lags_s[peak]), 0.0
+    first, last = before[-1], after[0]
+    width_s = float(lags_s[last] - lags_s[first])
+    gain = float(information[peak] - np.concatenate([information[: first + 1], information[last:]]).max())
+    is_significant = 0.5 * gain * moving_s / width_s >= LIMITS.offset_log_likelihood
+    return float(lags_s[peak]), float(np.exp(gain)) if is_significant and width_s <= LIMITS.offset_peak_s else 0.0
