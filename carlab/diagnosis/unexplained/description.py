@@ -185,6 +185,10 @@ REGIMES: tuple[tuple[str, str, Callable[[dict[str, FloatArray]], FloatArray]], .
 )
 
 
+FEATURE_DIGITS = 6
+"""Decimal digits of a feature; smaller differences are errors of rounding, for example rates of constant commands."""
+
+
 def worst_regime(features: dict[str, FloatArray], window_errors: FloatArray) -> str:
     """The feature whose upper third has the largest errors, as a rule such as ``speed > 2 m/s``.
 
@@ -194,7 +198,7 @@ def worst_regime(features: dict[str, FloatArray], window_errors: FloatArray) -> 
     """
     best, text = 1.0, "everywhere alike"
     for name, unit, value in REGIMES:
-        feature = value(features)
+        feature = value(features).round(FEATURE_DIGITS)
         limit = float(np.quantile(feature, UNEXPLAINED.regime_quantile))
         high, low = window_errors[feature > limit], window_errors[feature <= limit]
         if min(len(high), len(low)) < UNEXPLAINED.regime_windows_min:
