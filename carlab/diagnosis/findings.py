@@ -307,7 +307,7 @@ class Diagnosis:
                 where["place"] = dict(zip(("x", "y", "radius"), where["place"], strict=True))
         if (residual := made["unexplained"]) is not None:
             residual["class"] = residual.pop("kind")
-            if residual["share"] < EVIDENCE.unexplained_share_min:
+            if not residual["share"] >= EVIDENCE.unexplained_share_min:
                 made["unexplained"] = None
         stated = made.pop("car_file_parameters")
         for name, estimate in made["parameters"].items():

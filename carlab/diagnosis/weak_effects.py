@@ -7,6 +7,7 @@ it, after a refit of the other parameters, differ by less than a share of the er
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -45,13 +46,20 @@ def without_harmful_effects(
 
 
 def held_out_conditions(held_out: HeldOut, without: Fit, fit: Fit, settings: SelectionSettings) -> Alternatives:
-    """Conditions that ``fit`` lowers the error on held-out recordings, by its score or by its robust likelihood."""
+    """Conditions that ``fit`` lowers the error on held-out recordings, by its score or by its robust likelihood.
+
+    With a single held-out block, the likelihood has no standard error, and its sign counts.
+    """
     before, after = held_out.final_error(without.config), held_out.final_error(fit.config)
     gain, error = held_out.gain(before, after)
     rise = held_out.score(before) / max(held_out.score(after), 1e-12) - 1.0
     return (
         (Condition("selection.min_held_out_rise", rise, settings.min_held_out_rise),),
-        (Condition("selection.min_held_out_z", gain / error, settings.min_held_out_z),),
+        (
+            Condition(
+                "selection.min_held_out_z", gain / (error if math.isfinite(error) else 1.0), settings.min_held_out_z
+            ),
+        ),
     )
 
 

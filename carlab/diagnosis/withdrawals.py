@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from carlab.diagnosis.decisions import Decision, passes
+from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.findings import Withdrawal
 
 REASONS: Mapping[str, str] = {
-    "selection.supported_z_min": "left-out blocks do not support it if the correlation of the errors is considered",
+    "selection.supported_z_min": "its gain on left-out blocks is not significant with decorrelated errors",
     "selection.min_practical_size": "it changes the predictions by a small part of the remaining error",
-    "selection.min_held_out_rise": "it does not lower the error on held-out recordings",
+    "selection.min_held_out_rise": "the error on held-out recordings does not fall",
     "evidence.identity_distance_min": "its parameters do not differ significantly from those without the effect",
     "evidence.range_ratio_min": "the interval of its parameter reaches the end of the range",
     "rivals.curve_z_min": "a measured curve of the command predicts left-out blocks better",
-    "rivals.min_explained_share": "it explains less than half of the error",
+    "rivals.min_explained_share": "it explains too small a share of the error",
     "rivals.min_unnamed_share": "physics outside the catalogue explains much of the error",
     "rivals.unnamed_ratio": "physics outside the catalogue explains more of the error in its place",
 }
@@ -42,5 +42,5 @@ def withdrawn_effects(
 
 def _reason(decision: Decision) -> str:
     """The reason by the first set of conditions; all sets fail."""
-    failed = next(c for conditions in decision.alternatives for c in conditions if not passes(((c,),)))
-    return REASONS.get(failed.setting, UNCONFIRMED)
+    failed = [c.setting for conditions in decision.alternatives for c in conditions if not c.holds]
+    return REASONS.get(failed[0], UNCONFIRMED) if failed else UNCONFIRMED

@@ -34,10 +34,10 @@ MIN_FEATURE_STD = 0.01
 """Minimum standard deviation of a feature of the state [m/s, rad/s, 1]: a constant command has no unit."""
 MIN_STD = 1e-6
 """Minimum standard deviation of an error [m, rad, m/s, rad/s]: keeps noise-free recordings finite."""
-MEASURING = (ADAPTATION.window_s, ADAPTATION.window_s)
-"""Length and stride [s] of the windows that measure the disturbances, one after the other."""
-WEIGHING = (ADAPTATION.weight_horizon_s, ADAPTATION.weight_stride_s)
-"""The same of the windows that weigh the candidates."""
+MEASUREMENT_SPACING_S = (ADAPTATION.window_s, ADAPTATION.window_s)
+"""Length and stride [s] of the windows that measure the disturbances; they follow each other without overlap."""
+WEIGHT_SPACING_S = (ADAPTATION.weight_horizon_s, ADAPTATION.weight_stride_s)
+"""Length and stride [s] of the windows whose errors give the weights of the candidates."""
 SINGLE_AND_ALL = ((True,) * 4, *(tuple(k == own for k in range(4)) for own in range(4)))
 """Which of the four drifting disturbances a candidate has: all, or one."""
 
@@ -194,7 +194,7 @@ def adapt(
     Raises:
         DataError: the car moves in no window.
     """
-    windows = _windows(segments, velocity_window_s2, MEASURING)
+    windows = _windows(segments, velocity_window_s2, MEASUREMENT_SPACING_S)
     processes = _processes(noise, time_constants_s, np.array(drifts, dtype=np.float64))
     at = np.zeros((*processes.std.shape[:1], len(windows), processes.std.shape[1]))
     for _ in range(ADAPTATION.linearisations):
@@ -239,7 +239,7 @@ def choose_noise(
         DataError: the car moves in no window.
     """
     settings = ADAPTATION
-    windows = _windows(segments, velocity_window_s2, MEASURING)
+    windows = _windows(segments, velocity_window_s2, MEASUREMENT_SPACING_S)
     measured = linearised(windows, config, np.zeros((1, len(windows), len(settings.drift_std))))
     calm = np.quantile(np.abs(measured.error[0]), settings.calm_quantile, axis=0)
     calm = np.maximum(calm / ndtri(0.5 + 0.5 * settings.calm_quantile), MIN_STD)
@@ -253,7 +253,7 @@ def choose_noise(
         settings.dof,
     )
     best = int(np.argmin(run_filter(measured, processes).nll.sum(axis=1)))
-    windows = _windows(segments, velocity_window_s2, WEIGHING)
+    windows = _windows(segments, velocity_window_s2, WEIGHT_SPACING_S)
     error_std, white_share = _as_std(errors[best] * calm), float(whites[best])
     plain = _spread(simulate_windows(windows, config)[0], windows)
     feature_std = cast(FeatureStd, tuple(np.maximum(state_features(windows).std(axis=0), MIN_FEATURE_STD).tolist()))
@@ -277,7 +277,7 @@ def _with_losses(
 ) -> AdaptiveModel:
     """The model with the losses of all candidates along the segments; without a long enough window the same model."""
     try:
-        windows = _windows(segments, velocity_window_s2, WEIGHING)
+        windows = _windows(segments, velocity_window_s2, WEIGHT_SPACING_S)
     except DataError:
         return model
     errors = bounded_final_errors(windows, model.candidates(windows))

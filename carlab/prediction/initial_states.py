@@ -49,7 +49,7 @@ def without_curvature_bias(windows: PredictionWindows, config: SimulatorConfig) 
     cubic = _local_polynomial(simulated[..., :3], width, 3, windows.period_s)
     quintic = _local_polynomial(simulated[..., :3], 2 * half + 1, 5, windows.period_s)
     angle = windows.initial_states[:, 2] - true[:, 2]
-    bias, difference = (with_turned_positions(d, angle) for d in (cubic - true, quintic - cubic))
+    bias, difference = (with_rotated_positions(d, angle) for d in (cubic - true, quintic - cubic))
     invalid = ~np.isfinite(np.concatenate([bias, difference], axis=1)).all(axis=1)
     bias[invalid], difference[invalid] = 0.0, 0.0
     measured_difference = windows.curvature_bias
@@ -89,7 +89,7 @@ def _local_polynomial(pose: FloatArray, width: int, order: int, period_s: float)
     return body_states(value, slope)
 
 
-def with_turned_positions(differences: FloatArray, angle: FloatArray) -> FloatArray:
+def with_rotated_positions(differences: FloatArray, angle: FloatArray) -> FloatArray:
     """Differences of states (..., 6) with x, y rotated by ``angle`` (...)."""
     out = differences.copy()
     out[..., 0], out[..., 1] = to_world(differences[..., 0], differences[..., 1], angle)

@@ -19,7 +19,7 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.prediction.adaptation_settings import ADAPTATION
 from carlab.prediction.errors import bounded, simulation_errors
-from carlab.prediction.initial_states import with_turned_positions
+from carlab.prediction.initial_states import with_rotated_positions
 from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -69,7 +69,7 @@ class LocalErrorModel:
                 known[:, : len(past)] = self._is_known(windows, past, rows)
             weights = _weights(states[rows], past_states, known)
             expected[rows] = np.tensordot(weights, errors, axes=1)
-        return predicted - with_turned_positions(expected, windows.initial_states[:, 2, None])
+        return predicted - with_rotated_positions(expected, windows.initial_states[:, 2, None])
 
     def _windows(self, segments: Sequence[RecordingSegment], horizon_s: float) -> PredictionWindows | None:
         """Windows of the segments; None if the car moves in none."""

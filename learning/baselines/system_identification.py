@@ -131,7 +131,7 @@ def identify(
         model: simulator with a distribution of its parameters.
         inputs: (n, D).
         outputs: (n, O).
-        noise_std: prior noise (O,), worth ``PRIOR_ROWS`` rows.
+        noise_std: prior noise (O,), with the weight of ``PRIOR_ROWS`` rows.
         seed: of the restarts.
 
     Raises:

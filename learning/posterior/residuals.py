@@ -74,7 +74,7 @@ def fit_residuals(errors: Tensor, prior_std: Tensor | None = None, fitted_rows: 
 
     Args:
         errors: (n, O).
-        prior_std: prior standard deviation (O,), positive, worth ``PRIOR_ROWS`` rows; None: no prior.
+        prior_std: prior standard deviation (O,), positive, with the weight of ``PRIOR_ROWS`` rows; None: no prior.
         fitted_rows: degrees of freedom used by the fit of the mean, in rows: its parameters divided by the outputs.
 
     Raises:

@@ -73,6 +73,13 @@ def test_commands_are_shifted_to_the_clock_of_the_poses(seconds, late_s):
     assert abs(int(np.argmin(row_errors)) - 4) <= 1
 
 
+def test_report_names_the_recordings_whose_clock_is_not_measured():
+    """An offset of more than a third of a recording is not found."""
+    _, _, faults = check([random_drive(60, 4.0), random_drive(10, 4.0)], [], NOMINAL)
+    (action,) = offsets(faults)
+    assert action.endswith("the audit finds no offset in 1 of 2 recordings: check their clocks too.")
+
+
 @pytest.mark.parametrize("seconds", [10, 60])
 def test_one_clock_is_not_reported(seconds):
     episode = random_drive(seconds)

@@ -1,15 +1,18 @@
 """Reasons of withdrawn effects in reports."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 from carlab.benchmark.cases.case import make_case
-from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.decisions import Condition, Decision, passes
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.findings import Withdrawal
 from carlab.diagnosis.report.write import write_report
 from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.weak_effects import held_out_conditions
 from carlab.diagnosis.withdrawals import REASONS, withdrawn_effects
 from tests.helpers.case_files import car_in, episodes_in, write_case
 
@@ -33,9 +36,29 @@ def test_reason_is_that_of_the_last_failed_test() -> None:
     found = withdrawn_effects(decisions, ("steering_lag", "motor_lag", "marker_offset"), ("marker_offset",))
     assert [w.id for w in found] == ["steering_lag", "motor_lag"]
     assert [w.reason for w in found] == [
-        "it does not lower the error on held-out recordings",
+        "the error on held-out recordings does not fall",
         "it changes the predictions by a small part of the remaining error",
     ]
+
+
+class OneBlock:
+    """Held-out windows of one block: the gain in log-likelihood has no standard error. The score rises."""
+
+    def final_error(self, config: str) -> str:
+        return config
+
+    def score(self, error: str) -> float:
+        return {"without": 2.0, "with": 2.1}[error]
+
+    def gain(self, before: str, after: str) -> tuple[float, float]:
+        return 5.0, math.inf
+
+
+def test_sign_of_the_likelihood_counts_with_one_held_out_block() -> None:
+    fits = (SimpleNamespace(config=name) for name in ("without", "with"))
+    rise, likelihood = held_out_conditions(OneBlock(), *fits, DEFAULT.selection)  # type: ignore[arg-type]
+    assert not passes((rise,))
+    assert passes((likelihood,))
 
 
 def test_effect_without_a_failed_test_was_replaced_by_physics_outside_the_catalogue() -> None:

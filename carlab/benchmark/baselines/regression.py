@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlab.benchmark.baselines.data import Prepared, Steps, held_out_score
-from carlab.benchmark.baselines.terms import AT_END_ONLY, OBSERVED_SIZE, Term, effect_of, library
+from carlab.benchmark.baselines.terms import AT_END_ONLY, MOCAP_EFFECT_SIZE, Term, effect_of, library
 from carlab.benchmark.world.simulation import FloatArray
 
 THRESHOLDS = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
@@ -143,5 +143,7 @@ def corrected_score(data: Prepared, system: System, coefficients: FloatArray) ->
     inside = [(name, c) for name, c in active if effect_of(name) not in AT_END_ONLY]
     lags = [c for name, c in active if effect_of(name) in AT_END_ONLY]
     return held_out_score(
-        data, lambda steps: added(steps, inside), lambda steps: -OBSERVED_SIZE * sum(lags) * steps.rates(at_end=True)
+        data,
+        lambda steps: added(steps, inside),
+        lambda steps: -MOCAP_EFFECT_SIZE * sum(lags) * steps.rates(at_end=True),
     )

@@ -24,7 +24,7 @@ from carlab.benchmark.world.simulation import FloatArray
 Term = Callable[[Steps], FloatArray]
 PATCHES = 8
 AT_END_ONLY = ("velocity_filter_lag",)
-OBSERVED_SIZE = 0.01
+MOCAP_EFFECT_SIZE = 0.01
 """Size of the effects of motion capture [m, rad, s]."""
 # Moderate sizes of changes of the commands for a 1:10 car.
 _SIZES = {
@@ -125,13 +125,13 @@ def _grip(factors: Callable[[Steps], tuple[object, object]]) -> Term:
 
 
 def _observed(seen: Callable[[FloatArray, FloatArray], FloatArray]) -> Term:
-    """Measured velocity v + OBSERVED_SIZE seen(v, rate), inverted at the start and applied at the end."""
+    """Measured velocity v + MOCAP_EFFECT_SIZE seen(v, rate), inverted at the start and applied at the end."""
 
     def term(s: Steps) -> FloatArray:
         starts = s.starts.copy()
-        starts[:, 3:] -= OBSERVED_SIZE * seen(s.starts[:, 3:], s.rates(at_end=False))
+        starts[:, 3:] -= MOCAP_EFFECT_SIZE * seen(s.starts[:, 3:], s.rates(at_end=False))
         ends = s.rolled(starts=starts)
-        ends[:, 3:] += OBSERVED_SIZE * seen(s.ends[:, 3:], s.rates(at_end=True))
+        ends[:, 3:] += MOCAP_EFFECT_SIZE * seen(s.ends[:, 3:], s.rates(at_end=True))
         return _gained(s, ends)
 
     return term

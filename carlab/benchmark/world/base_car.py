@@ -6,8 +6,6 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import reduce
-from operator import getitem
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +28,7 @@ FREE = {
     "steering.max_angle": "max_angle",
 }
 """Base parameters that a refit may change, by dotted name; the others are measured and fixed."""
-FIELDS = {
+FIELD_BY_NAME = {
     "vehicle.mass": "mass",
     "vehicle.yaw_inertia": "yaw_inertia",
     "vehicle.front_axle": "front_axle",
@@ -111,14 +109,23 @@ class BaseCar:
     def read(cls, path: Path) -> BaseCar:
         """Read a file of ``write``."""
         tables = tomllib.loads(path.read_text())
-        return cls(**{field: reduce(getitem, name.split("."), tables) for name, field in FIELDS.items()})  # type: ignore[arg-type]
+        values: dict[str, Any] = {}
+        for name, field in FIELD_BY_NAME.items():
+            entry: Any = tables
+            for key in name.split("."):
+                entry = entry[key]
+            values[field] = entry
+        return cls(**values)
 
     def table(self) -> dict[str, Any]:
         """The car file as nested tables."""
         tables: dict[str, Any] = {}
-        for name, field in FIELDS.items():
+        for name, field in FIELD_BY_NAME.items():
             *path, key = name.split(".")
-            reduce(lambda table, part: table.setdefault(part, {}), path, tables)[key] = getattr(self, field)
+            table = tables
+            for part in path:
+                table = table.setdefault(part, {})
+            table[key] = getattr(self, field)
         tables["mocap"]["dropout"] = 0.0
         return tables
 

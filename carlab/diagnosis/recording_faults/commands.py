@@ -61,7 +61,7 @@ def check_yaw_direction(repairs: Sequence[EpisodeRepair]) -> None:
 def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -> None:
     """Check and repair the command columns of all recordings; a common fault needs less evidence in each of them."""
     expected_s = nominal.command_delay_s + nominal.mocap.latency_s
-    motions = [_correct_clock_offset(repair, expected_s) for repair in repairs]
+    motions = _motions_after_clock_offsets(repairs, expected_s)
     pairs = list(zip(repairs, motions, strict=True))
     by_recording = [_responses(repair, motion) for repair, motion in pairs]
     is_restamped = _check_clock(repairs, motions, by_recording)
@@ -77,19 +77,28 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
             _check_shift(repairs, responses, channel, expected_s)
 
 
-def _correct_clock_offset(repair: EpisodeRepair, expected_s: float) -> GridMotion:
-    """Shift both commands to the delay of the car file if their clock differs by seconds. Returns the motion."""
-    motion = grid_motion(repair.times_s, repair.motion(), repair.segment)
-    fault = clock_offset(motion, repair.times_s, list(repair.commands.T))
-    if fault is None:
-        return motion
+def _motions_after_clock_offsets(repairs: Sequence[EpisodeRepair], expected_s: float) -> list[GridMotion]:
+    """The motion of each recording, after both commands were shifted where their clock differs by seconds."""
+    motions = [grid_motion(repair.times_s, repair.motion(), repair.segment) for repair in repairs]
+    faults = [clock_offset(m, r.times_s, list(r.commands.T)) for r, m in zip(repairs, motions, strict=True)]
+    advice = "set the clocks of both computers by NTP or PTP"
+    if others := faults.count(None):
+        advice += f"; the audit finds no offset in {others} of {len(faults)} recordings: check their clocks too"
+    return [
+        motion if fault is None else _without_clock_offset(repair, fault, expected_s, advice)
+        for repair, motion, fault in zip(repairs, motions, faults, strict=True)
+    ]
+
+
+def _without_clock_offset(repair: EpisodeRepair, fault: Fault, expected_s: float, advice: str) -> GridMotion:
+    """Shift both commands to the delay of the car file. Returns the motion of the remaining rows."""
     rows = round((expected_s - fault.evidence["delay_s"]) / repair.period_s)
     late_s = rows * repair.period_s
     for channel in range(len(COMMAND_CHANNELS)):
         repair.retime(channel, -late_s)
     repair.trim(abs(rows) + 1, at_end=rows > 0)
-    earlier = f"{abs(late_s):.2f} s {'earlier' if rows > 0 else 'later'}"
-    repair.repaired(fault, f"the commands were stamped {earlier}; set the clocks of both computers by NTP or PTP")
+    change = f"{'reduced' if rows > 0 else 'increased'} by {abs(late_s):.2f} s"
+    repair.repaired(fault, f"the stamps of the commands were {change}; {advice}")
     return grid_motion(repair.times_s, repair.motion(), repair.segment)
 
 

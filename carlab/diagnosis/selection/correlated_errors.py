@@ -22,7 +22,11 @@ from carlab.diagnosis.selection.search import restrict
 
 def without_unsupported_effects(problem: SearchProblem, found: SearchResult, control: RunControl) -> SearchResult:
     """The result without effects that decorrelated errors do not support; unchanged if the simulator has no error."""
-    if not found.effects or problem.excess_of(found.scale) < problem.settings.selection.min_model_error:
+    if (
+        control.stop()
+        or not found.effects
+        or problem.excess_of(found.scale) < problem.settings.selection.min_model_error
+    ):
         return found
     model = refit(problem, found.effects, found.best, decorrelating(problem, found.model))
     result = eliminate(problem, model, control, stage="support", setting="supported_z_min", min_effects=0)

@@ -218,7 +218,7 @@ class RunControl:
     workers: FunctionWorkers = field(default_factory=FunctionWorkers)
 
     def part(self, first: float, last: float, label: str = "") -> RunControl:
-        """The control of a part of the run, between two shares of it; ``label`` precedes its activities."""
+        """The control of a part of the run, from progress ``first`` to ``last``; ``label`` precedes its activities."""
 
         def progress(activity: str, share: float) -> None:
             self.progress(f"{label}{activity}", first + (last - first) * share)

@@ -185,8 +185,8 @@ REGIMES: tuple[tuple[str, str, Callable[[dict[str, FloatArray]], FloatArray]], .
 )
 
 
-FEATURE_DIGITS = 6
-"""Decimal digits of a feature; smaller differences are errors of rounding, for example rates of constant commands."""
+FEATURE_DIGITS = 3
+"""Decimal digits of a feature (SI units); smaller values are noise or rounding, as rates of constant commands."""
 
 
 def worst_regime(features: dict[str, FloatArray], window_errors: FloatArray) -> str:
