@@ -23,13 +23,15 @@ STAMP = ("stamp_ns", 1e-9)
 """Column of the stamps, and its unit [s]."""
 COMMANDS = {"steering": ("servo_us", 1500.0, -500.0), "throttle": ("motor_us", 1500.0, 500.0)}
 """Column, value of the neutral command, and change of the value for the command +1 (steering: full left)."""
+MIN_ROWS = 3
+"""Minimum number of rows of a recording."""
 
 
 def motive_poses(path: Path, body: str, up_axis: str) -> Array:
     """Rows t [s], x, y [m], yaw [rad] (N, 4) of a rigid body, without frames in which the cameras do not see it."""
     with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = list(csv.reader(file))
-    settings = dict(zip(lines[0][::2], lines[0][1::2], strict=False))
+        lines = [line for line in csv.reader(file) if any(map(str.strip, line))]
+    settings = dict(zip(lines[0][::2], lines[0][1::2], strict=False)) if lines else {}
     if settings.get("Rotation Type") != "Quaternion" or settings.get("Length Units") != "Meters":
         raise SystemExit(f"{path}: export the take again with rotation type Quaternion and unit Meters.")
     first = next(k for k, line in enumerate(lines) if line[:1] == ["Frame"])
@@ -55,14 +57,22 @@ def motive_poses(path: Path, body: str, up_axis: str) -> Array:
             position, quaternion = z_up_vector(position), z_up_quaternion(quaternion)
         (x, y, _), yaw = base_link_pose(position, quaternion, 0.0, (0.0, 0.0, 0.0))
         rows.append((float(line[1]), x, y, yaw))
+    if not rows:
+        raise SystemExit(f"{path}: the cameras see '{body}' in no frame.")
     return np.array(rows)
 
 
 def commands(path: Path) -> Array:
-    """Rows t [s], steering, throttle (M, 3), commands in [-1, 1]."""
+    """Rows t [s], steering, throttle (M, 3) in the order of the stamps, commands in [-1, 1]."""
+    names = [STAMP[0], *(name for name, _, _ in COMMANDS.values())]
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
-    columns = [np.array([float(row[name]) for row in rows]) for name in (STAMP[0], *(c[0] for c in COMMANDS.values()))]
+    if not rows:
+        raise SystemExit(f"{path} has no commands.")
+    if missing := [name for name in names if name not in rows[0]]:
+        raise SystemExit(f"{path} has no column {', '.join(missing)}; edit the names at the top of the script.")
+    rows.sort(key=lambda row: float(row[STAMP[0]]))
+    columns = [np.array([float(row[name]) for row in rows]) for name in names]
     scaled = [(column - c[1]) / c[2] for column, c in zip(columns[1:], COMMANDS.values(), strict=True)]
     return np.column_stack([columns[0] * STAMP[1], *scaled])
 
@@ -70,8 +80,8 @@ def commands(path: Path) -> Array:
 def joined(poses: Array, sent: Array) -> Array:
     """One row t, x, y, yaw, steering, throttle for each pose, with the newest command before it."""
     during = (poses[:, 0] >= sent[0, 0]) & (poses[:, 0] <= sent[-1, 0])
-    if not during.any():
-        raise SystemExit("No pose lies between the first and the last command; correct --first-pose.")
+    if during.sum() < MIN_ROWS:
+        raise SystemExit(f"{during.sum()} poses lie between the first and the last command; correct --first-pose.")
     newest = np.searchsorted(sent[:, 0], poses[during, 0], side="right") - 1
     return np.column_stack([poses[during], sent[newest, 1:]])
 
@@ -108,6 +118,9 @@ def main() -> None:
     if options.files and (len(options.files) != 2 or math.isnan(options.first_pose)):
         parser.error("give the CSV of Motive, the log of the commands, and --first-pose.")
     take, log, first_s = example_files(options.out) if not options.files else (*options.files, options.first_pose)
+    for file in (take, log):
+        if not file.is_file():
+            raise SystemExit(f"{file} does not exist.")
 
     poses, sent = motive_poses(take, options.body, options.up_axis), commands(log)
     poses[:, 0] += first_s - sent[0, 0]

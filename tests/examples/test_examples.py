@@ -100,6 +100,62 @@ def test_pose_of_a_motive_export_is_that_of_the_rigid_body(tmp_path: Path) -> No
     assert motive_poses(take, "car", "y") == pytest.approx(np.array([[0, 1, 2, np.pi / 2], [1, 3, 0, 0]]))
 
 
+def motive_take(frames: str) -> str:
+    """A take of one rigid body."""
+    return (
+        "Format Version,1.23,Rotation Type,Quaternion,Length Units,Meters\n\n"
+        f",Type{',Rigid Body' * 7}\n,Name{',car' * 7}\n"
+        ",,Rotation,Rotation,Rotation,Rotation,Position,Position,Position\n"
+        f"Frame,Time (Seconds),X,Y,Z,W,X,Y,Z\n{frames}"
+    )
+
+
+POSES = "".join(f"{k},{0.1 * k:.1f},0,0,0,1,{0.1 * k:.1f},0,0\n" for k in range(20))
+LOG = "stamp_ns,servo_us,motor_us\n" + "".join(f"{k}00000000,1500,{1500 + 10 * k}\n" for k in range(20))
+Join = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Join:
+    """Write both files, run join_logs.py, and return the rows of its CSV."""
+
+    def run(take: str | None = motive_take(POSES), log: str = LOG, first_pose: str = "0") -> np.ndarray:
+        monkeypatch.chdir(tmp_path)
+        if take is not None:
+            Path("take.csv").write_text(take, encoding="utf-8")
+        Path("log.csv").write_text(log, encoding="utf-8")
+        monkeypatch.setattr(sys, "argv", ["", "take.csv", "log.csv", f"--first-pose={first_pose}", "--out", "out"])
+        runpy.run_path(str(EXAMPLES / "join_logs.py"), run_name="__main__")
+        return np.genfromtxt("out/joined.csv", delimiter=",", skip_header=1)
+
+    return run
+
+
+def test_join_reads_blank_lines_and_commands_in_any_order(join: Join) -> None:
+    """Pose k is at 0.1 k metres and 0.1 k seconds, and throttle k is 0.02 k."""
+    header, *lines = LOG.splitlines()
+    rows = join(motive_take(POSES) + "\n \n", "\n".join([header, *reversed(lines), "", ""]), "0.05")
+    assert len(rows) == 19
+    assert rows[:, 1] == pytest.approx(0.1 * np.arange(19))
+    assert rows[:, 5] == pytest.approx(0.02 * np.arange(19))
+
+
+@pytest.mark.parametrize(
+    ("files", "sentence"),
+    [
+        ({"take": motive_take("0,0.0,,,,,,,\n1,0.1,,,,,,,\n")}, r"take.csv: the cameras see 'car' in no frame\."),
+        ({"take": None}, r"take.csv does not exist\."),
+        ({"take": ""}, "export the take again"),
+        ({"log": LOG.replace("servo_us", "servo")}, "log.csv has no column servo_us; edit the names"),
+        ({"log": "stamp_ns,servo_us,motor_us\n"}, r"log.csv has no commands\."),
+        ({"first_pose": "1.9"}, r"^1 poses lie between .* correct --first-pose\."),
+    ],
+)
+def test_join_states_what_is_missing(join: Join, files: dict[str, str | None], sentence: str) -> None:
+    with pytest.raises(SystemExit, match=sentence):
+        join(**files)
+
+
 def test_own_policy_holds_its_target_speed(output_of: Example) -> None:
     text = output_of("own_policy.py")
     speed = float(text.partition("last second: ")[2].split()[0])
