@@ -73,6 +73,14 @@ def test_longer_offset_is_corrected_before_the_join(late_file, late_s, remedy):
     assert expected in finding.sentence
 
 
+def test_stamps_with_the_whole_offset_need_no_command_lag(late_file):
+    """The proposed change of the stamps includes the declared lag, so both together would correct too much."""
+    mapping = CANONICAL.with_options(command_lag_s=0.5)
+    (finding,) = import_csv(late_file(4.0), mapping=mapping).report.of("clock_offset")
+    assert 0.5 + 0.1 - finding.evidence["delay_s"] == pytest.approx(4.0, abs=0.15)
+    assert "and remove --command-lag" in finding.sentence
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["train_1", "train_2"])
 def test_detection_in_pieces_of_60_s(shared, name):

@@ -63,3 +63,41 @@ def test_part_of_a_quaternion_is_not_proposed_as_yaw():
         recognise_layout(["t", "x", "y", "qx", "qy", "qz", "qw", "steering", "throttle"], "drive.csv")
     assert "has no column yaw; it holds" in str(error.value)
     assert "compute yaw from the quaternion" in str(error.value)
+
+
+def test_topics_of_which_some_stamps_coincide_are_still_different_topics(tmp_path):
+    columns = joined_topics()
+    complete = foreign.drive(columns["t"])
+    for name, column in columns.items():
+        column[100:104] = complete[name][100:104]
+    path = foreign.write(tmp_path / "bag.csv", columns)
+    with pytest.raises(RefusedError, match="Only 4 of 400 rows have a number in each") as error:
+        import_csv(path, mapping=CANONICAL.with_options(missing="drop"))
+    assert "messages of different topics" in str(error.value)
+
+
+def test_commands_of_a_slow_topic_are_a_different_topic(tmp_path):
+    columns = foreign.drive(np.arange(400) / 60.0)
+    is_pose = np.arange(400) % 10 != 0
+    for name in ("x", "y", "yaw"):
+        columns[name][~is_pose] = np.nan
+    for name in ("steering", "throttle"):
+        columns[name][is_pose] = np.nan
+    with pytest.raises(RefusedError, match="messages of different topics"):
+        import_csv(foreign.write(tmp_path / "bag.csv", columns), mapping=CANONICAL)
+
+
+@pytest.mark.parametrize(
+    ("cell", "sentence"),
+    [
+        (np.nan, "Column 'x' has no number in 398 of 400 rows"),
+        (1e300, "Column 'x' has too large numbers in 398 of 400"),
+    ],
+)
+def test_lost_or_too_large_poses_are_not_messages_of_another_topic(tmp_path, cell, sentence):
+    columns = foreign.drive(np.arange(400) / 60.0)
+    columns["x"][2:] = cell
+    with pytest.raises(RefusedError) as error:
+        import_csv(foreign.write(tmp_path / "lost.csv", columns), mapping=CANONICAL)
+    assert sentence in str(error.value)
+    assert "topics" not in str(error.value)

@@ -27,6 +27,7 @@ from carlab.recording.faults.clock_offset import clock_offset
 from carlab.recording.faults.commands import (
     MIN_ROWS,
     CommandResponse,
+    GridMotion,
     command_response,
     grid_motion,
     moves_backward,
@@ -95,7 +96,9 @@ def audit_channels(
     if motion is None:
         return findings, np.zeros(len(t_s), dtype=bool)
     findings += file_checks.check_stale(t_s, values)
-    responses = _command_responses(channels, motion, mapping)
+    grid = grid_motion(t_s, motion, channels.segment)
+    sent = {channel: _sent_command(channels, channel, mapping) for channel in COMMAND_CHANNELS}
+    responses = {c: command_response(grid, t_s - mapping.command_lag_s, command, c) for c, command in sent.items()}
     has_wrong_yaw = any(finding.severity is Severity.FAULT for finding in heading)
     if not has_wrong_yaw and moves_backward(motion) and (fault := reversed_yaw(list(responses.values()))):
         findings.append(_finding(fault, mapping))
@@ -107,7 +110,7 @@ def audit_channels(
         )
         return findings, np.zeros(len(t_s), dtype=bool)
     found, spikes = _check_velocities(channels, motion, mapping)
-    findings += found + _check_commands(channels, motion, responses, mapping)
+    findings += found + _check_commands(t_s, motion, grid, sent, responses, mapping)
     states = velocity_references(motion)
     for name, channel in mapping.references.items():
         if name not in channels.extra:
@@ -167,7 +170,8 @@ def _clock_finding(fault: Fault, t_s: FloatArray, mapping: ColumnMapping) -> Fin
         fault = replace(fault, option=f"--command-lag {lag_s:g}")
         return Finding.of_fault(fault, remedy=f"use {fault.option}")
     change = f"{'subtract' if lag_s > 0 else 'add'} {abs(lag_s):g} s {'from' if lag_s > 0 else 'to'}"
-    return Finding.of_fault(fault, remedy=f"{change} the stamps of the commands, and join them with the poses again")
+    remedy = f"{change} the stamps of the commands, and join them with the poses again"
+    return Finding.of_fault(fault, remedy=remedy + (", and remove --command-lag" if mapping.command_lag_s else ""))
 
 
 def _check_velocities(
@@ -283,36 +287,24 @@ def _sent_command(channels: Channels, channel: str, mapping: ColumnMapping) -> F
     return command
 
 
-def _command_responses(
-    channels: Channels, motion: PoseMotion, mapping: ColumnMapping
-) -> dict[str, CommandResponse | None]:
-    """Response of the motion to each command."""
-    grid = grid_motion(channels.t_s, motion, channels.segment)
-    sent_s = channels.t_s - mapping.command_lag_s
-    return {
-        channel: command_response(grid, sent_s, _sent_command(channels, channel, mapping), channel)
-        for channel in COMMAND_CHANNELS
-    }
-
-
 def _check_commands(
-    channels: Channels,
+    t_s: FloatArray,
     motion: PoseMotion,
+    grid: GridMotion,
+    sent: Mapping[str, FloatArray],
     responses: Mapping[str, CommandResponse | None],
     mapping: ColumnMapping,
 ) -> list[Finding]:
     """Clock, sign and delay of both commands by their effect on the motion."""
     findings = []
-    grid = grid_motion(channels.t_s, motion, channels.segment)
-    sent = [_sent_command(channels, channel, mapping) for channel in COMMAND_CHANNELS]
-    offset = clock_offset(grid, channels.t_s - mapping.command_lag_s, sent)
+    offset = clock_offset(grid, t_s - mapping.command_lag_s, list(sent.values()))
     if offset is not None:  # with another clock, sign and delay mean nothing
-        return [_clock_finding(offset, channels.t_s, mapping)]
+        return [_clock_finding(offset, t_s, mapping)]
     is_long = grid.rows.sum() >= MIN_ROWS
     for index, (channel, response) in enumerate(responses.items()):
-        command = held_at(channels.t_s, _sent_command(channels, channel, mapping), -mapping.command_lag_s)
+        command = held_at(t_s, sent[channel], -mapping.command_lag_s)
         effect = EFFECTS[channel]
-        evidence = {} if response is None else _command_evidence(channel, channels.t_s, command, motion, response)
+        evidence = {} if response is None else _command_evidence(channel, t_s, command, motion, response)
         if response is None or response.best < LIMITS.command_explained[index]:
             if np.ptp(command) > MIN_COMMAND_RANGE and is_long:
                 sentence = f"{channel.capitalize()} explains too little of {effect}: its sign is unknown."

@@ -25,6 +25,9 @@ from carlab.recording.pose_velocity import BoolArray, IndexArray
 
 MIN_ROWS = 3
 """Minimum number of rows of a recording."""
+MIN_COMPLETE_SHARE = 0.5
+"""Rows with pose and command over rows of the rarer one; with less, rows are messages of different topics.
+Lost poses leave the command in each row with a pose: the share is 1. Different topics have few equal stamps."""
 MAX_NUMBER = 1e12
 """Larger numbers in SI units are markers of missing values or corrupt data."""
 MAX_STAMP = 1e20
@@ -59,13 +62,21 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
         whole &= ~(is_missing | is_too_large)
         findings += _cell_findings(channel, column, is_missing, is_too_large, mapping)
     is_empty_column = any(finding.evidence.get("share") == 1.0 for finding in findings)
-    if findings and whole.sum() < MIN_ROWS and not is_empty_column:
-        findings = [_joined_messages_finding(values, whole)]
+    if not is_empty_column and _has_different_topics(values):
+        findings = [_joined_messages_finding(values)]
     return findings, whole
 
 
-def _joined_messages_finding(values: Mapping[str, FloatArray], whole: BoolArray) -> Finding:
+def _has_different_topics(values: Mapping[str, FloatArray]) -> bool:
+    """Whether a pose and a command channel of ``values`` (N,) have their numbers in different rows."""
+    present = {channel: ~np.isnan(column) for channel, column in values.items()}
+    pairs = [(present[p], present[c]) for p in POSE_CHANNELS for c in COMMAND_CHANNELS if {p, c} <= present.keys()]
+    return any(np.sum(pose & sent) < MIN_COMPLETE_SHARE * min(pose.sum(), sent.sum()) for pose, sent in pairs)
+
+
+def _joined_messages_finding(values: Mapping[str, FloatArray]) -> Finding:
     """The fault of a table whose rows are messages of different topics, as ``values`` (N,) by channel show."""
+    whole = np.all(~np.isnan(np.stack(list(values.values()))), axis=0)
     sentence = (
         f"Only {whole.sum()} of {len(whole)} rows have a number in each of {', '.join(values)}: the rows are messages "
         "of different topics; write one row for each pose, with the newest command before it (pandas.merge_asof, or "
