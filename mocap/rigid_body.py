@@ -222,7 +222,7 @@ class RigidBodyPoseSource(Resource):
         try:
             body = select_body(models, self._selection)
         except NotReadyError as error:
-            if _matching_bodies(models, self._selection):  # two bodies match; a further one does not help
+            if _matching_bodies(models, self._selection):  # several bodies match, so a new definition does not help
                 reason = error.reasons[0]
         with self._new_sample:
             self._body, self._reason_for_no_body = body, reason
@@ -317,10 +317,16 @@ def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBody
     if len(chosen) == 1:
         return chosen[0]
     available = ", ".join(f"'{b.name}' (id {b.id})" for b in bodies)
+    if len(chosen) > 1:
+        raise NotReadyError(
+            "No motion capture",
+            [
+                f"several rigid bodies have the name {wanted}; set body_id in [hardware.mocap] (listen: --body-id) to "
+                f"one of {available}."
+            ],
+        )
     if not bodies:
         remedy = "it streams none: create one in Motive and switch Rigid Bodies on in the Data Streaming pane."
-    elif len(chosen) > 1:
-        remedy = f"several have that name: set body_id in [hardware.mocap] (listen: --body-id) to one of {available}."
     else:
         remedy = f"set body in [hardware.mocap] (listen: --body) to one of {available}."
     raise NotReadyError("No motion capture", [f"the server has no rigid body {wanted}; {remedy}"])

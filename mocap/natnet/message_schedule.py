@@ -20,13 +20,15 @@ MODE_PERIOD_S = 0.5
 class MessageSchedule:
     """Schedule of keep-alives, echoes, reconnects and requests for the server's mode and for changed models.
 
-    ``models_outdated`` is set by frames with the models-changed flag, ``models_uncertain`` by missing frames, which may
-    have had it. Both are cleared when models arrive, so that a lost request is repeated and a further change is
-    noticed. Requests after missing frames do not delay the request after a flag.
+    Frames with the models-changed flag set ``models_outdated``. Missing frames set ``models_uncertain``, since they may
+    have had the flag. A request clears both, and it is repeated until models arrive. A flag that is set after the last
+    request causes a further request, since the models that arrive may be older than the change. Requests after missing
+    frames do not delay the request after a flag.
     """
 
     def __init__(self, *, keepalives: bool) -> None:
         self.models_outdated = self.models_uncertain = False
+        self._is_change_unanswered = self._is_check_unanswered = False
         self.reconnecting = False
         self._keepalives = keepalives
         self._next_keepalive_s = self._next_echo_s = self._next_models_s = self._next_mode_s = -math.inf
@@ -38,8 +40,8 @@ class MessageSchedule:
         self._next_connect_s = now_s + RECONNECT_PERIOD_S
 
     def note_models(self) -> None:
-        """Note the arrival of models."""
-        self.models_outdated = self.models_uncertain = False
+        """Note the arrival of models, which answer the last request."""
+        self._is_change_unanswered = self._is_check_unanswered = False
 
     def note_server_info(self, now_s: float) -> None:
         """Note an answer to CONNECT at ``now_s``."""
@@ -63,13 +65,23 @@ class MessageSchedule:
             self._next_connect_s = now_s + RECONNECT_PERIOD_S
             self.reconnecting = True
             messages.append(MessageId.CONNECT)
-        if self.models_outdated and now_s >= self._next_models_s:
-            self._next_models_s = now_s + MODELS_PERIOD_S
-            messages.append(MessageId.REQUEST_MODELDEF)
-        elif self.models_uncertain and now_s >= self._next_check_of_models_s:
-            self._next_check_of_models_s = now_s + MODELS_PERIOD_S
+        if self._is_models_request_due(now_s):
             messages.append(MessageId.REQUEST_MODELDEF)
         if polls_mode and now_s >= self._next_mode_s:
             self._next_mode_s = now_s + MODE_PERIOD_S
             messages.append(MessageId.REQUEST)
         return messages
+
+    def _is_models_request_due(self, now_s: float) -> bool:
+        """Whether to request models now; the request counts as sent."""
+        has_changed = self.models_outdated or self._is_change_unanswered
+        needs_check = self.models_uncertain or self._is_check_unanswered
+        if has_changed and now_s >= self._next_models_s:
+            self._next_models_s = now_s + MODELS_PERIOD_S
+        elif needs_check and now_s >= self._next_check_of_models_s:
+            self._next_check_of_models_s = now_s + MODELS_PERIOD_S
+        else:
+            return False
+        self._is_change_unanswered, self._is_check_unanswered = has_changed, needs_check
+        self.models_outdated = self.models_uncertain = False
+        return True

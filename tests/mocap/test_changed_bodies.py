@@ -51,7 +51,7 @@ def test_changed_ids_are_noticed_if_every_frame_with_the_flag_is_lost(serve: Ser
 @pytest.mark.parametrize(
     ("bodies", "reason"),
     [
-        ((EmulatedBody("car", 1), EmulatedBody("car", 2)), "set body_id in [hardware.mocap]"),
+        ((EmulatedBody("car", 1), EmulatedBody("car", 2)), "several rigid bodies have the name 'car'; set body_id in"),
         ((EmulatedBody("lorry", 1), EmulatedBody("car", 1)), "'lorry' and 'car' have the same streaming id 1"),
         ((EmulatedBody("lorry", 1), EmulatedBody("truck", 2)), "define it again in Motive under the same name"),
     ],
@@ -66,3 +66,4 @@ def test_reason_why_the_body_has_become_unknown_is_named(
         until(lambda: bool(source.problems()))
         (text,) = source.problems()
         assert reason in text
+        assert "has no rigid body" not in text

@@ -207,6 +207,18 @@ def test_models_are_requested_once_a_second_until_they_arrive() -> None:
     assert sent_in(schedule, 14.0, 16.0, has_clock=False, settled=True) == []
 
 
+@pytest.mark.parametrize("flag", ["models_outdated", "models_uncertain"])
+def test_change_between_a_request_and_its_answer_is_requested_too(flag: str) -> None:
+    schedule = MessageSchedule(keepalives=False)
+    schedule.models_outdated = True
+    assert schedule.due(10.0, has_clock=False, settled=True) == [MessageId.REQUEST_MODELDEF]
+    setattr(schedule, flag, True)
+    schedule.note_models()
+    assert sent_in(schedule, 10.01, 12.5, has_clock=False, settled=True) != []
+    schedule.note_models()
+    assert sent_in(schedule, 12.5, 15.0, has_clock=False, settled=True) == []
+
+
 def test_request_after_missing_frames_does_not_delay_that_after_a_change() -> None:
     schedule = MessageSchedule(keepalives=False)
     schedule.models_uncertain = True
