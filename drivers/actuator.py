@@ -53,7 +53,7 @@ class Actuator(Resource):
         self._number = 0
         self._armed_epoch = 0
         self._latched = ""  # fault known in the main process; it stays if the sender cannot be reached
-        self._unmeasured_cause = ""  # why the last measurement of the time-out was refused
+        self._unmeasured_cause = ""  # why the last measurement of the time-out has no result
 
     @property
     def is_open(self) -> bool:
@@ -109,8 +109,8 @@ class Actuator(Resource):
         """Send no command until the firmware releases the motor; ``health`` and ``problems`` have the result.
 
         The motor is in neutral meanwhile. Nothing is measured, and ``health`` has a warning, unless the actuator is
-        connected, disarmed and settled in neutral, and the firmware reports the release. Raises NotOpenError,
-        ActuatorFaultError.
+        connected, disarmed and settled in neutral until the end, and the firmware reports the release. Raises
+        NotOpenError, ActuatorFaultError.
         """
         self.require_no_fault()
         self._await(lambda s: s.is_neutral_settled, ANSWER_TIMEOUT_S)
@@ -124,7 +124,10 @@ class Actuator(Resource):
             is_cancelled = status.epoch > epoch or status.state != SenderState.CONNECTED
             return is_cancelled or not math.isnan(status.motor_timeout_s)
 
-        self._await(is_over, MAX_TIMEOUT_S + ANSWER_TIMEOUT_S)
+        status = self._await(is_over, MAX_TIMEOUT_S + ANSWER_TIMEOUT_S)
+        if math.isnan(status.motor_timeout_s):
+            self._unmeasured_cause = status.fault or "the measurement was interrupted; measure again."
+            return
         self._await(lambda s: s.state != SenderState.CONNECTED or not s.is_motor_released, ANSWER_TIMEOUT_S)
 
     def command(self, action: Action) -> Action:
@@ -237,10 +240,8 @@ class Actuator(Resource):
                 f"computer or the cable fails; {kind.timeout_hint}"
             )
         if self._unmeasured_cause:
-            warnings.append(
-                f"the time-out of the {self.config.device_kind.name} was not measured: {self._unmeasured_cause} "
-                "Lift the wheels, pull the cable while they turn, and see that they stop."
-            )
+            kind = self.config.device_kind
+            warnings.append(f"the time-out of the {kind.name} was not measured: {self._unmeasured_cause}")
         device = self.config.device_kind.name.lower()
         readings = {
             "battery_v": status.input_v,

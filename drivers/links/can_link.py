@@ -29,12 +29,18 @@ def open_bus(interface: str, channel: str, bitrate: int) -> can.BusABC:
 
     Interfaces whose bitrate the system sets (socketcan) ignore ``bitrate``. The channel of ``gs_usb`` is a number.
     ``udp_multicast`` with an IPv4 group stays on this host's loopback interface; its channel is GROUP or GROUP:PORT.
+    Raises NotReadyError if the channel of ``gs_usb`` is not a number.
     """
     if interface == "udp_multicast" and _is_ipv4(channel):
         from drivers.links.loopback_multicast import LoopbackMulticastBus
 
         return LoopbackMulticastBus(channel)
-    adapter = int(channel) if interface == "gs_usb" and channel.isdecimal() else channel
+    if interface == "gs_usb" and not channel.isdecimal():
+        raise NotReadyError(
+            f"CAN bus gs_usb {channel} cannot be opened",
+            ('the channel of gs_usb is the number of the adapter, such as "0".',),
+        )
+    adapter = int(channel) if interface == "gs_usb" else channel
     return can.Bus(adapter, interface=interface, ignore_config=True, bitrate=bitrate)
 
 

@@ -20,10 +20,10 @@ DRAIN_S: Final = 0.02
 BACKLOG_LIMIT_BYTES: Final = 96
 """A larger backlog means that the device has stopped reading (about two ticks of commands)."""
 BACKLOG_S: Final = 0.005
-"""Time for which a backlog must last [s].
+"""Longest duration of a backlog [s]; a longer backlog is discarded.
 
 Linux (cdc-acm) counts a whole buffer of 1280 bytes for each write to a USB device until it is transferred, which takes
-about a millisecond. To flush the buffer cancels the transfer.
+about a millisecond. Flushing the buffer cancels the transfer.
 """
 PSEUDO_TERMINAL_MAJORS: Final = range(136, 144)
 """Major device numbers of pseudo-terminals on Linux, the ports of emulated devices."""
@@ -49,7 +49,7 @@ class SerialLink:
         self.setting = setting
         self.opens = 0
         self._serial: serial.Serial | None = None
-        self._t_without_backlog_s = 0.0
+        self._last_empty_s = 0.0
 
     def open(self) -> None:
         """Open the port. Raises NotReadyError with a list of the available ports."""
@@ -61,7 +61,7 @@ class SerialLink:
         except (OSError, ValueError, OverflowError, termios.error) as error:  # SerialException is an OSError
             raise NotReadyError(f"Serial port {self.port} cannot be opened", (self._reason(error),)) from error
         self._serial = port
-        self._t_without_backlog_s = time.monotonic()
+        self._last_empty_s = time.monotonic()
         self.opens += 1
 
     def write(self, data: bytes) -> None:
@@ -112,14 +112,13 @@ class SerialLink:
             port.close()
 
     def _discard_backlog(self, port: serial.Serial) -> None:
-        """Discard the unsent bytes after a backlog of ``BACKLOG_S``."""
+        """Discard the unsent bytes if the backlog lasts longer than ``BACKLOG_S``."""
         now_s = time.monotonic()
-        has_backlog = port.out_waiting > BACKLOG_LIMIT_BYTES
-        if has_backlog and now_s - self._t_without_backlog_s <= BACKLOG_S:
-            return
-        if has_backlog:
+        if port.out_waiting > BACKLOG_LIMIT_BYTES:
+            if now_s - self._last_empty_s <= BACKLOG_S:
+                return
             port.reset_output_buffer()
-        self._t_without_backlog_s = now_s
+        self._last_empty_s = now_s
 
     def _opened(self) -> serial.Serial:
         if self._serial is None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.device import FirmwareIdentity, Telemetry
-from drivers.sender.timeout_measurement import TimeoutMeasurement
+from drivers.sender.timeout_measurement import UNREPORTED_TIMEOUT, TimeoutMeasurement
 
 NEUTRAL_FRAMES = 3
 NEUTRAL_SPAN_S = 0.12
@@ -265,7 +265,7 @@ class SenderLogic:
         if self.state != SenderState.CONNECTED or not self._is_neutral_settled:
             return self.fault or "the time-out is measured in neutral only; stop the car."
         if self.values is None or self.values.motor_timeout_active is None:
-            return "the firmware does not report its time-out."
+            return UNREPORTED_TIMEOUT
         return ""
 
     def _reset_fault(self, now_s: float) -> None:

@@ -11,6 +11,10 @@ ADVISED_TIMEOUT_S = 0.35
 
 300 ms, the longest advised time-out, and 50 ms for the measurement.
 """
+UNREPORTED_TIMEOUT = (
+    "the firmware does not report its time-out. Lift the wheels, unplug the USB or CAN cable of the motor controller "
+    "while they turn, and see that they stop."
+)
 
 
 class TimeoutMeasurement:

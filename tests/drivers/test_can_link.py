@@ -160,6 +160,13 @@ def test_gs_usb_adapter_is_opened_by_its_number(monkeypatch: pytest.MonkeyPatch)
     assert 48_000_000 / (timing["brp"] * quanta) == 250_000
 
 
+@pytest.mark.parametrize("channel", ["can0", "", "-1"])
+def test_gs_usb_adapter_without_a_number_is_not_ready(channel: str) -> None:
+    with pytest.raises(NotReadyError) as caught:
+        CanLink("gs_usb", channel).open()
+    assert caught.value.reasons == ('the channel of gs_usb is the number of the adapter, such as "0".',)
+
+
 def test_every_interface_gets_the_bitrate(monkeypatch: pytest.MonkeyPatch) -> None:
     bitrates = []
 

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.realtime
 
 MOVING = Action(0.5, 0.3)
 CALIBRATION = ActuatorCalibration()
+ADVICE = "Lift the wheels, unplug the USB or CAN cable of the motor controller while they turn, and see that they stop."
 CONTROLLED, RELEASED = (MotorValues(erpm=0.0, fault_code=0, status_bits=bits) for bits in (0, 1))
 
 
@@ -88,7 +89,7 @@ def test_timeout_that_the_firmware_does_not_report_is_a_warning() -> None:
         actuator.measure_motor_timeout()
         (warning,) = actuator.health().warnings
         assert warning.startswith("the time-out of the VESC was not measured: the firmware does not report")
-        assert warning.endswith("pull the cable while they turn, and see that they stop.")
+        assert warning.endswith(ADVICE)
         actuator.arm()
 
 
@@ -104,6 +105,31 @@ def test_stop_of_another_thread_ends_the_measurement_with_neutral() -> None:
         assert running.seconds < 1.0
         until(lambda: len(firmware.log.motor()) >= count + 3)
         assert actuator.status().state == SenderState.FAULT
+
+
+def test_refusal_while_armed_is_a_warning_without_the_advice_for_old_firmware() -> None:
+    with served(0.3) as firmware, connected(firmware) as actuator:
+        actuator.arm()
+        actuator.measure_motor_timeout()
+        assert actuator.health().warnings == (
+            "the time-out of the VESC was not measured: the time-out is measured in neutral only; stop the car.",
+        )
+
+
+@pytest.mark.parametrize("planned", [True, False])
+def test_interrupted_measurement_is_a_warning_until_the_next_one(*, planned: bool) -> None:
+    with served(math.inf) as firmware, connected(firmware) as actuator:
+        thread = threading.Thread(target=actuator.measure_motor_timeout)
+        thread.start()
+        until(lambda: actuator.status().epoch == 1)
+        actuator.stop(planned=planned)
+        thread.join(TIMEOUT_S)
+        (warning,) = actuator.health().warnings
+        cause = "the measurement was interrupted; measure again." if planned else actuator.status().fault
+        assert warning == f"the time-out of the VESC was not measured: {cause}"
+        actuator.reset_fault()
+        actuator.measure_motor_timeout()
+        assert all("was not measured" not in warning for warning in actuator.health().warnings)
 
 
 def test_lost_link_ends_the_measurement() -> None:
@@ -189,8 +215,8 @@ def test_fault_ends_the_measurement_with_neutral() -> None:
 def test_measurement_is_refused_while_armed_and_for_old_firmware() -> None:
     bench = Bench(CONTROLLED)
     bench.request(Request.ARM)
-    assert "in neutral only" in bench.request(Request.MEASURE_TIMEOUT)
+    assert bench.request(Request.MEASURE_TIMEOUT) == "the time-out is measured in neutral only; stop the car."
     assert bench.tick(0.1, CONTROLLED) > 5
     old = Bench(MotorValues(erpm=0.0, fault_code=0))
-    assert old.request(Request.MEASURE_TIMEOUT) == "the firmware does not report its time-out."
+    assert old.request(Request.MEASURE_TIMEOUT) == f"the firmware does not report its time-out. {ADVICE}"
     assert old.tick(0.1, MotorValues(erpm=0.0, fault_code=0)) > 5
