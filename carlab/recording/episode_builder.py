@@ -241,9 +241,20 @@ def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
 
 def _started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
     """The EpisodeStarted of an episode of arrays; without metadata the car counts as real."""
-    texts, unknown = episode.metadata, "unknown"
-    start = (1, float(episode.times_s[0]), 0, unknown, Reality.REAL, unknown, unknown, 0, episode.period_s, 0)
-    defaults = facts_of(EpisodeStarted(*start))
+    texts = episode.metadata
+    unknown = EpisodeStarted(
+        episode=1,
+        t_s=float(episode.times_s[0]),
+        wall_ns=0,
+        car="unknown",
+        reality=Reality.REAL,
+        policy="unknown",
+        task="unknown",
+        seed=0,
+        period_s=episode.period_s,
+        history_length=0,
+    )
+    defaults = facts_of(unknown)
     ended = _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
     written = {*defaults, "config_toml", *ended, RECOVERED, RECOVERY}  # a copy of a damaged recording is not damaged
     metadata = {k: v for k, v in texts.items() if k not in written and not k.startswith(STATISTICS)}

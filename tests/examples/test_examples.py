@@ -85,7 +85,7 @@ def test_poses_and_commands_of_two_programs_are_joined(output_of: Example, tmp_p
 
 
 def test_pose_of_a_motive_export_is_that_of_the_rigid_body(tmp_path: Path) -> None:
-    """Y up: a car at X = 1 m, Z = -2 m that is turned to the left by 90 degrees is at x = 1 m, y = 2 m."""
+    """Y up: a car at X = 1 m, Z = -2 m with a heading of 90 degrees is at x = 1 m, y = 2 m."""
     motive_poses = runpy.run_path(str(EXAMPLES / "join_logs.py"))["motive_poses"]
     half = np.sqrt(0.5)
     take = tmp_path / "take.csv"

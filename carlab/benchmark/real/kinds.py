@@ -213,12 +213,12 @@ def _yaw_rate_without_spikes(table: Table) -> FloatArray:
 
 
 def _misalignment(table: Table, size: float, draw: float) -> TransformedRecording:
-    """Turn the tracked body's axes against the car's."""
+    """Rotate the tracked body's axes against the car's."""
     angle = _sign(draw) * size
     cos, sin = np.cos(angle), np.sin(angle)
     vx, vy = cos * table["vx"] + sin * table["vy"], cos * table["vy"] - sin * table["vx"]
-    turned = {"yaw": wrapped(table["yaw"] + angle), "vx": vx, "vy": vy}
-    return TransformedRecording({**table, **turned}, (Truth("angle", angle),))
+    rotated = {"yaw": wrapped(table["yaw"] + angle), "vx": vx, "vy": vy}
+    return TransformedRecording({**table, **rotated}, (Truth("angle", angle),))
 
 
 def _latency(table: Table, size: float, draw: float) -> TransformedRecording:

@@ -71,8 +71,8 @@ class Fit:
         """Design effect of an effect's parameters: variance by blocks over that for independent errors, at least one.
 
         Twice the gain of several parameters is a sum of chi-squares weighted by such ratios, so their mean divides it
-        (Kent 1982). The median of all parameters replaces it if that of the effect is undefined (a limit never
-        reached).
+        (Kent 1982). If no parameter of the effect influences the errors (a limit that no command reaches), the result
+        is the median of all parameters.
         """
         assert self.design_effects is not None
         prefix = f"effects.{effect}."

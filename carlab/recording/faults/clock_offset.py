@@ -1,8 +1,8 @@
 """Commands whose clock differs by seconds from that of the poses: correlation with the motion over many lags.
 
 Yaw rate follows steering times speed, and forward acceleration follows throttle. The unexplained variance of both is
-compared at all lags. A clock offset makes one lag outside ``LAGS_S`` better than all others; a periodic drive makes
-several lags equally good, and slow commands make a broad range of lags good. Both show no offset.
+compared at all lags. With a clock offset it has one narrow minimum, outside ``LAGS_S``. With a periodic drive it has
+several equal minima, and with slow commands a wide one. Both show no offset.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ def clock_offset(motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatAr
     """
     if motion.rows.sum() < MIN_ROWS:
         return None
-    information = np.zeros(1)  # mutual information of Gaussian variables [2 nats]
-    for channel, command in zip(COMMAND_CHANNELS, commands, strict=True):
-        if np.std(command) >= LIMITS.constant_command:
-            correlation = np.clip(_lag_correlation(motion, t_s, command, channel), 0.0, 0.999)
-            information = information - np.log1p(-(correlation**2))
-    if len(information) == 1:
+    correlations = [
+        np.clip(_lag_correlation(motion, t_s, command, channel), 0.0, 0.999)
+        for channel, command in zip(COMMAND_CHANNELS, commands, strict=True)
+        if np.std(command) >= LIMITS.constant_command
+    ]
+    if not correlations:
         return None
+    information = -np.log1p(-(np.array(correlations) ** 2)).sum(axis=0)  # twice that of Gaussian variables [nat]
     lags_s = motion.period_s * np.arange(-(len(information) // 2), len(information) // 2 + 1, dtype=np.float64)
     lag_s, ratio = _distinct_peak(lags_s, information, float(motion.rows.sum() * motion.period_s))
     if LAGS_S[0] <= lag_s <= LAGS_S[-1] or ratio < LIMITS.offset_unexplained_ratio:
@@ -89,7 +90,7 @@ def _lag_products(values: FloatArray, delayed: FloatArray) -> FloatArray:
 
 
 def _distinct_peak(lags_s: FloatArray, information: FloatArray, moving_s: float) -> tuple[float, float]:
-    """Lag of the peak [s], and the least ratio of the unexplained variance elsewhere over that at the peak.
+    """Lag of the peak [s], and the smallest ratio of the unexplained variance at other lags over that at the peak.
 
     The ratio is 0 for a peak at the edge of the search, for a broad peak, and for one that is not significant. The
     log-likelihood counts one independent sample for each width of the peak in ``moving_s`` of motion.
