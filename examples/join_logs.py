@@ -4,7 +4,7 @@
 script makes both from a drive of the simulated car.
 
 Motive: export the take as CSV with rigid bodies, rotation type Quaternion and unit Meters. Log of commands: edit
-``COMMANDS`` and ``STAMP`` below. For messages of a ROS 2 bag, replace ``motive_poses`` by a reader of your pose topic.
+``COMMANDS`` and ``STAMP`` below. ``carlab import`` reads ROS bags directly.
 """
 
 import argparse

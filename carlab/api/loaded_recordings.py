@@ -13,6 +13,8 @@ import numpy as np
 from carlab.api.recordings import Recording, is_csv, load, required_file
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.hashes import sha256_of
+from carlab.recording.ros.bag import is_bag
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import DataFault, RecordingUse
@@ -113,7 +115,7 @@ def check_contents(uses: Iterable[RecordingUse]) -> None:
 
 def _episodes_of_run(item: RecordingSource) -> tuple[Sequence[RecordingSource], Sequence[RecordingSource]]:
     """Episodes of a run folder to fit and to hold out (every third); for others the recording itself, to fit."""
-    if not isinstance(item, Path) or not item.is_dir():
+    if not isinstance(item, Path) or not item.is_dir() or is_bag(item):
         return [item], []
     if not (item / "episodes").is_dir():
         runs = sorted(entry for entry in item.iterdir() if (entry / "episodes").is_dir())
@@ -160,7 +162,7 @@ def _read_item(item: RecordingSource, role: str, latency_s: float, loaded: Loade
             missing_ticks = int(read.episode.metadata.get("missing_ticks", 0))
             text = f"reported: the file {read.recovery}."
             loaded.faults.append(DataFault(INCOMPLETE_FILE, str(path), missing_ticks, text))
-    return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
+    return RecordingUse(str(path), sha256_of(path), role)
 
 
 def _check_arrays(episode: EpisodeData) -> None:

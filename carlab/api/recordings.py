@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 from carlab.api.runs import html_table
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
-from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
+from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping
 from carlab.recording.episode_builder import RECOVERY
+from carlab.recording.layouts import recognise_layout
+from carlab.recording.ros.bag import is_bag
 
 if TYPE_CHECKING:
     from carlab.recording.audit.report import AuditReport
+    from carlab.recording.csv.foreign import ImportedRecording
 
 CSV_ENDINGS = (".csv", ".csv.gz")
 
@@ -27,9 +30,9 @@ class Recording:
     Attributes:
         path: the file.
         episodes: one episode, or several if a CSV was split.
-        announcement: recognised layout and conversions of a CSV.
-        audit: findings in a CSV; None for MCAP.
-        mapping: the column mapping of a CSV; None if its layout was recognised.
+        announcement: recognised layout and conversions of a CSV or a ROS bag.
+        audit: findings in a CSV or a ROS bag; None for carlab's MCAP.
+        mapping: the column mapping of a CSV or a ROS bag; None if its layout was recognised.
         is_recovered: whether the MCAP file is incomplete and its complete ticks were recovered.
         recovery: predicate about an incomplete file: what is wrong, how many ticks were recovered, and the remedy.
     """
@@ -109,12 +112,13 @@ def is_csv(path: Path) -> bool:
 
 
 def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None, **options: Any) -> Recording:
-    """Read an MCAP recording or a CSV (.csv, .csv.gz).
+    """Read an MCAP recording, a CSV (.csv, .csv.gz) or a ROS bag (a .bag, .db3 or .mcap file, or a folder).
 
     Args:
         path: the file. An incomplete recording (.mcap.partial) is recovered.
-        mapping: column mapping of a CSV, a TOML file or a ``ColumnMapping``; not needed for known layouts.
-        options: changes of the mapping of a CSV, with the names of ``carlab import``'s options:
+        mapping: column mapping of a CSV or a bag, a TOML file or a ``ColumnMapping``; not needed for known layouts of
+            a CSV.
+        options: changes of the mapping, with the names of ``carlab import``'s options:
             ``velocity_frame="world"``, ``vx_unit="km/h"``, ``steering_sign=-1``, ``gaps="split"`` ...
 
     Returns:
@@ -130,14 +134,12 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
             "arrays make a carlab.core.episode_data.EpisodeData."
         )
     path = required_file(Path(path))
-    if is_csv(path):
-        from carlab.recording.csv.foreign import import_csv
-
+    if is_foreign(path):
         resolved = resolved_mapping(path, mapping, options)
-        imported = import_csv(path, mapping=resolved)
+        imported = import_foreign(path, resolved)
         return Recording(path, imported.episodes, imported.announcement, imported.report, resolved)
     if mapping is not None or options:
-        raise ConfigError(f"{path} is not a CSV; remove the mapping and its options.")
+        raise ConfigError(f"{path} is neither a CSV nor a ROS bag; remove the mapping and its options.")
     from carlab.recording.mcap.source import read_episode
 
     episode = read_episode(path)
@@ -145,8 +147,21 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
     return Recording(path, (episode,), is_recovered=bool(recovery), recovery=recovery)
 
 
+def is_foreign(path: Path) -> bool:
+    """Whether a recording is of another program: a CSV or a ROS bag."""
+    return is_csv(path) or is_bag(path)
+
+
+def import_foreign(path: Path, mapping: ColumnMapping | None) -> ImportedRecording:
+    """Import a CSV or a ROS bag. Raises ConfigError or DataError if it cannot be imported as declared."""
+    from carlab.recording.csv.foreign import import_csv
+    from carlab.recording.ros.bag_import import import_bag
+
+    return (import_bag if is_bag(path) else import_csv)(path, mapping=mapping)
+
+
 def required_file(path: Path, what: str = "The recording") -> Path:
-    """Return the path of an existing file. Raises ConfigError if it is not a file."""
+    """Return the path of an existing file or folder of a ROS bag. Raises ConfigError for another path."""
     if not path.exists():
         from carlab.recording.sink import partial_path
 
@@ -157,7 +172,7 @@ def required_file(path: Path, what: str = "The recording") -> Path:
                 "be read."
             )
         raise ConfigError(f"{what} '{path}' does not exist; check the path.")
-    if path.is_dir():
+    if path.is_dir() and not is_bag(path):
         raise ConfigError(f"{what} '{path}' is a folder; name a file in it (a run has episodes/0001.mcap).")
     return path
 
@@ -207,7 +222,7 @@ def save_run(run: Path | str, path: Path | str) -> Path:
     return path
 
 
-CHANNEL_OPTIONS = ("unit", "sign", "scale")
+CHANNEL_OPTIONS = ("unit", "sign", "scale", "neutral")
 RENAMED_OPTIONS = {
     "velocity_lag": "velocity_lag_s",
     "yaw_offset": "yaw_offset_rad",
@@ -220,7 +235,7 @@ RENAMED_OPTIONS = {
 def resolved_mapping(
     path: Path, mapping: ColumnMapping | Path | str | None, options: dict[str, Any]
 ) -> ColumnMapping | None:
-    """The mapping with options; None without both, so that the layout is recognised.
+    """The mapping with options; None without both, so that the layout of a CSV is recognised, or for a bag without one.
 
     Raises:
         ConfigError: the mapping file or an option is invalid.
@@ -243,6 +258,8 @@ def resolved_mapping(
         raise ConfigError(f"mapping is {mapping!r}; give a TOML file or a ColumnMapping.")
     if not columns and not whole:
         return mapping
+    if mapping is None and is_bag(path):
+        return None
     if mapping is None:
         mapping = recognise_layout(read_csv(path).header, path.name, whole.get("rate_hz"))
     return mapping.with_options(columns=columns, **whole)

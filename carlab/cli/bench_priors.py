@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import tempfile
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from carlab.cli.console import console, progress
 from carlab.cli.diagnose import Diagnose
 from carlab.cli.recordings import recordings_in
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.hashes import sha256_of
 from carlab.core.json_files import read_json
 from carlab.studies.priors import checked_counts, prior_models, run_prior_study
 from carlab.studies.regression.recordings import RecordedCase
@@ -86,7 +86,7 @@ def check_held_out(model: Path, held_out: Path) -> None:
         known = {use["sha256"] for use in read_json(report)["recordings"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{report} cannot be read ({error!r}); diagnose again.") from error
-    if hashlib.sha256(held_out.read_bytes()).hexdigest() in known:
+    if sha256_of(held_out) in known:
         raise ConfigError(
             f"{model} was diagnosed with {held_out.name}, which is held out here; diagnose without it, or remove "
             "--diagnosed."

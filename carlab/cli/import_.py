@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from carlab.api.recordings import is_csv, required_file, resolved_mapping
+from carlab.api.recordings import import_foreign, is_foreign, required_file, resolved_mapping
 from carlab.cli.console import console
 from carlab.cli.options import new_file, options_of
 from carlab.cli.recordings import print_findings
@@ -27,20 +27,20 @@ OTHER_OPTIONS = ("recording", "out", "mapping", "report", "verbose")
 @dataclass
 @options_of(ColumnMapping)
 class Import:
-    """Convert a CSV of another program (.csv, .csv.gz) to an MCAP recording, and report its data faults.
+    """Convert a CSV of another program or a ROS bag to an MCAP recording, and report its data faults.
 
-    Known layouts are recognised by their header; others need --mapping. Only what the layout, the
+    Known layouts of a CSV are recognised by their header; others, and bags, need --mapping. Only what the layout, the
     mapping or an option declares is converted; suspected faults are reported with the option that corrects them.
     """
 
     recording: Positional[Path]
-    """The CSV file."""
+    """The CSV file (.csv, .csv.gz), or the ROS bag: a file (.bag, .db3, .mcap) or the folder of a ROS 2 bag."""
 
     out: Path | None = None
-    """MCAP file to write; by default in the folder of the CSV. A split recording has -1, -2 ... in its file names."""
+    """MCAP file to write; by default beside the recording. A split recording has -1, -2 ... in its file names."""
 
     mapping: Path | None = None
-    """TOML file with the columns: tables [columns.x] with name, unit, sign, scale."""
+    """TOML file with the columns: tables [columns.x] with name, unit, sign, scale, neutral."""
 
     report: Path | None = None
     """Also write the findings as JSON, with the reason if the import is refused. The report of a refused import is
@@ -104,41 +104,49 @@ class Import:
     steering_scale: float | None = None
     """Factor on steering, to bring it into [-1, 1]."""
 
+    steering_neutral: float | None = None
+    """Content of the column without steering, for example 1500 for pulse widths in microseconds."""
+
     throttle_sign: Sign | None = None
     """-1 if positive throttle drives backwards."""
 
     throttle_scale: float | None = None
     """Factor on throttle, to bring it into [-1, 1]."""
 
+    throttle_neutral: float | None = None
+    """Content of the column without throttle."""
+
     yaw_offset_rad: Annotated[float | None, arg(name="yaw-offset")] = None
     swap_xy: bool | None = None
     repair_yaw_rate: bool | None = None
-    missing: Literal["error", "drop"] | None = None
+    missing: Literal["error", "drop", "hold"] | None = None
     gaps: Literal["error", "split", "keep"] | None = None
     stamps: Literal["error", "drop"] | None = None
     clock: Literal["column", "velocity", "even"] | None = None
     command_lag_s: Annotated[float | None, arg(name="command-lag")] = None
     rate_hz: Annotated[float | None, arg(name="rate")] = None
+    message_times: Literal["auto", "header", "received"] | None = None
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
-        """Import the CSV, print the findings, write the recording."""
+        """Import the recording, print the findings, write the MCAP file."""
         from carlab.recording.audit.report import AuditReport, RefusedError
-        from carlab.recording.csv.foreign import import_csv
         from carlab.recording.mcap.sink import write_episode
 
         required_file(self.recording)
-        if not is_csv(self.recording):
-            raise ConfigError(f"{self.recording} is not a CSV; name a .csv or .csv.gz file.")
-        stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
-        out = self.out if self.out is not None else self.recording.with_name(f"{stem}.mcap")
+        if not is_foreign(self.recording):
+            raise ConfigError(
+                f"{self.recording} is neither a CSV nor a ROS bag; name a .csv, .csv.gz, .bag or .db3 file, an .mcap "
+                "file of ROS, or the folder of a ROS 2 bag (with metadata.yaml)."
+            )
+        out = self.out if self.out is not None else self._default_out()
         new_file(out, "--out", ".mcap")
         if self.report is not None and not _is_report_of_refusal(self.report):
             new_file(self.report, "--report", ".json")
         try:
-            imported = import_csv(self.recording, mapping=self._mapping())
+            imported = import_foreign(self.recording, self._mapping())
         except DataError as error:
             found = error.all_findings if isinstance(error, RefusedError) else ()
             self._write_report(AuditReport(self.recording.name, "", found, refusal=str(error)))
@@ -156,12 +164,19 @@ class Import:
             try:
                 write_episode(episode, path)
             except KeyboardInterrupt:
-                # A partial import is useless; the CSV remains.
+                # A partial import is useless; the source remains.
                 path.with_name(f"{path.name}.partial").unlink(missing_ok=True)
                 raise
             seconds = episode.times_s[-1] - episode.times_s[0]
             console.print(f"{path}: {episode.ticks} commands, {seconds:.1f} s")
         return 0
+
+    def _default_out(self) -> Path:
+        """Path of the MCAP file beside the recording; for an MCAP of ROS, with another name."""
+        name = self.recording.resolve().name
+        stem = name if self.recording.is_dir() else name.removesuffix(".gz").rpartition(".")[0]
+        ending = "_carlab.mcap" if name.endswith(".mcap") else ".mcap"
+        return self.recording.with_name(f"{stem}{ending}")
 
     def _write_report(self, report: AuditReport) -> None:
         if self.report is not None:

@@ -1,4 +1,4 @@
-"""What the columns of a foreign CSV mean: declared in TOML, or known of a layout that its header gives away.
+"""What the columns of a foreign table mean: declared in TOML, or known from the header of a CSV.
 
 A mapping declares; the audit (``carlab.recording.audit``) detects. Only what is declared is converted.
 """
@@ -6,7 +6,6 @@ A mapping declares; the audit (``carlab.recording.audit``) detects. Only what is
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Container, Mapping, Sequence
@@ -14,7 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from carlab.core.errors import ConfigError, DataError
+from carlab.core.errors import ConfigError
+from carlab.core.quantities import FloatArray
 from carlab.core.tables import check_keys, from_table
 from carlab.core.toml_files import read_toml
 
@@ -52,16 +52,22 @@ MAX_LAG_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ColumnSource:
-    """Where one channel comes from: value = sign * scale * (factor of ``unit``) * column."""
+    """Where one channel comes from: value = sign * scale * (factor of ``unit``) * (column - ``neutral``)."""
 
     name: str
-    """Column name in the file's header."""
+    """Column name in the file's header. In a ROS bag: topic and field, as in ``/drive/drive/steering_angle``."""
     unit: str | None = None
     """Unit in the file; left out, the SI unit is taken and the audit refuses what plainly is not SI."""
     sign: Literal[1, -1] = 1
     """-1 where the file counts the other way (yaw clockwise, steering positive to the right)."""
     scale: float = 1.0
     """Any further factor, for example 0.04 for steering in [-25, 25]."""
+    neutral: float = 0.0
+    """Content of the column for the command 0, for example 1500 for pulse widths in microseconds."""
+
+    def values(self, channel: str, column: FloatArray) -> FloatArray:
+        """The channel in SI units (N,) from its column (N,)."""
+        return (column - self.neutral) * self.factor(channel)
 
     def factor(self, channel: str) -> float:
         """Factor from the column to the channel's SI unit. Raises ConfigError for an unknown unit or a scale of 0."""
@@ -77,7 +83,9 @@ class ColumnSource:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMapping:
-    """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``.
+    """How the columns of a CSV or a ROS bag become an episode.
+
+    ``columns`` names the source of each channel in ``CHANNELS``.
 
     Raises:
         ConfigError: an unknown channel or unit, a scale, rate or lag that is out of range, one column for two
@@ -115,12 +123,16 @@ class ColumnMapping:
     """Known delay of the command columns behind the moment at which the commands were sent [s]."""
     rate_hz: float | None = None
     """Row rate [Hz] of a file without a time column."""
-    missing: Literal["error", "drop"] = "error"
-    """Rows with a missing value: ``error``, or ``drop`` them (the command before is then held across them)."""
+    missing: Literal["error", "drop", "hold"] = "error"
+    """Rows with a missing value: ``error``, ``drop`` them (the command before is then held across them), or ``hold``
+    the newest value of each other column in the rows with a pose, for tables of several topics."""
     gaps: Literal["error", "split", "keep"] = "error"
     """Gaps in time: ``error``, ``split`` into episodes there and where the pose jumps, or ``keep`` one episode."""
     stamps: Literal["error", "drop"] = "error"
     """Time stamps that do not increase: ``error``, or ``drop`` those rows."""
+    message_times: Literal["auto", "header", "received"] = "auto"
+    """Times of the messages of a ROS bag: of their ``header``, or at which the recorder ``received`` them. ``auto``: of
+    the header, except for topics without a header or with a clock of their own."""
 
     def __post_init__(self) -> None:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
@@ -129,11 +141,15 @@ class ColumnMapping:
             raise ConfigError(
                 f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero, at most {max_rate_hz:g}."
             )
+        if self.rate_hz is not None and self.missing == "hold":
+            raise ConfigError("Held values need times, so a file without a time column cannot have missing = hold.")
         self._check_dead_reckoning()
         _check_lag("velocity_lag", self.velocity_lag_s)
         _check_lag("command_lag", self.command_lag_s)
         for channel, source in self.columns.items():
             source.factor(channel)
+            if source.neutral != 0.0 and channel not in COMMAND_CHANNELS:
+                raise ConfigError(f"{channel} has no neutral value; only steering and throttle have one.")
         self._check_distinct_columns()
         for name, channel in self.references.items():
             if not isinstance(channel, str):
@@ -252,71 +268,6 @@ def load_mapping(path: Path | str) -> ColumnMapping:
     return dataclasses.replace(from_table(ColumnMapping, {"columns": {}, **table}, str(path)), columns=sources)
 
 
-CANONICAL = ColumnMapping({name: ColumnSource(name) for name in CHANNELS}, layout="canonical")
-"""carlab's own CSV: SI units, velocities in the body frame, steering positive to the left."""
-
-# lasgroup/simulation_transfer, recordings_rc_car_v0. Declared, each checked on both files:
-# - vx_world, vy_world are in the world frame: median difference to the differentiated pose 0.004 m/s there, against
-#   0.5 to 1 m/s if read as body velocities.
-# - all velocities are backward differences of the pose (they match those half a period better than any other shift),
-#   so they are half of the nominal 1/30 s late.
-# - yaw_rate: a negative spike of 85 to 245 rad/s in each of the 14 + 9 rows where yaw passes 0 counter-clockwise, none
-#   clockwise: a difference of an angle in [0, 2 pi) whose wrap was handled on one side only. The pose there is clean.
-# - steering is positive to the left and throttle positive forward already: nothing to flip.
-ETH = ColumnMapping(
-    {
-        **CANONICAL.columns,
-        "vx": ColumnSource("vx_world"),
-        "vy": ColumnSource("vy_world"),
-    },
-    layout="eth",
-    velocity_frame="world",
-    velocity_lag_s=0.5 / 30.0,
-    repair_yaw_rate=True,
-)
-
-# Lorenzo-Lyons/DART. Declared:
-# - the pose is Vicon's, stamped by "vicon time" when it arrived: read on an even 100 Hz instead, what a local cubic
-#   leaves of x and y falls by a tenth to two fifths in each of the files. Sensors and commands come at 10 Hz and are
-#   repeated in these rows.
-# - commands are sent at 10 Hz and held (racecar_pkg/src/system_id_gamepad_universal.py), and the logger copies the
-#   newest at 10 Hz of its own (publish_sensors_and_inputs_universal.py): a row is 0 to 0.1 s behind what was sent, by
-#   a phase that stays for a recording; 0.05 s on average. Uncorrected, the acceleration comes before the throttle.
-# - the car multiplies the throttle by the dead-man's safety value (their ROS_packages/racecar_pkg/src/
-#   racecar_universal.py: car.throttle = throttle * safety_value); the steering acts regardless. In 70_racetrack_lap
-#   the logged throttle is 0.25 for 676 rows in which the car stands still and safety_value is 0.
-# - "vel encoder" and "W (IMU)" measure vx and yaw rate again, through filters: kept for comparison only.
-_DART_COMMANDS = {"steering": ColumnSource("steering"), "throttle": ColumnSource("throttle")}
-DART = ColumnMapping(
-    {
-        "t": ColumnSource("vicon time", unit="s"),
-        "x": ColumnSource("vicon x", unit="m"),
-        "y": ColumnSource("vicon y", unit="m"),
-        "yaw": ColumnSource("vicon yaw", unit="rad"),
-        **_DART_COMMANDS,
-    },
-    layout="dart",
-    throttle_gate="safety_value",
-    references={"vel encoder": "vx", "W (IMU)": "yaw_rate"},
-    clock="even",
-    command_lag_s=0.05,
-)
-DART_ONBOARD = ColumnMapping(
-    {
-        "t": ColumnSource("elapsed time sensors", unit="s"),
-        "vx": ColumnSource("vel encoder", unit="m/s"),
-        "yaw_rate": ColumnSource("W (IMU)", unit="rad/s"),
-        **_DART_COMMANDS,
-    },
-    layout="dart on-board",
-    throttle_gate="safety_value",
-    dead_reckoning=True,
-)
-_QUATERNION = re.compile(r"(orientation|rotation|quat)\w*[._ ]?w$|^q[._]?w$", re.IGNORECASE)
-"""Name of a column with the scalar part of an orientation, as motion capture and ROS export it."""
-_ORDER = (ETH, CANONICAL, DART, DART_ONBOARD)  # an export of DART data is canonical and keeps its sensors beside
-
-
 def missing_columns(mapping: ColumnMapping, header: Sequence[str]) -> list[str]:
     """Columns that ``mapping`` needs and ``header`` lacks, as texts ``channel 'column'``."""
     needed = ["t", *COMMAND_CHANNELS]
@@ -334,34 +285,28 @@ def missing_columns(mapping: ColumnMapping, header: Sequence[str]) -> list[str]:
     return lacking + [name for name in named if name not in header]
 
 
-def _n_present(mapping: ColumnMapping, header: Sequence[str]) -> int:
-    """Number of columns of ``mapping`` in ``header``."""
-    return sum(source.name in header for source in mapping.columns.values())
-
-
-def recognise_layout(header: Sequence[str], where: str, rate_hz: float | None = None) -> ColumnMapping:
-    """The preset whose columns ``header`` holds; with a row rate [Hz], the time column may be missing.
-
-    Raises DataError that names what is missing and the remedy.
-    """
-    presets = [preset.with_options(rate_hz=rate_hz) for preset in _ORDER]
-    for preset, mapping in zip(_ORDER, presets, strict=True):
-        particular = [preset.columns[c].name for c in ("vx", "vy") if preset is ETH]
-        if not missing_columns(mapping, header) and all(name in header for name in particular):
-            return preset if rate_hz is None else mapping
-    nearest = min(presets, key=lambda mapping: (len(missing_columns(mapping, header)), -_n_present(mapping, header)))
-    lacking = missing_columns(nearest, header)
-    names = [source.name for source in nearest.columns.values()]
-    spare = [name for name in header if name not in names]
-    has_quaternion = "yaw" in lacking and any(_QUATERNION.search(name) for name in header)
-    wanted = [name for name in lacking if name != "yaw" or not has_quaternion]
-    near = difflib.get_close_matches(wanted[0].split(" (")[0], spare, n=1, cutoff=0.4) if wanted else []
-    hint = f" (is it '{near[0]}'?)" if near else ""
-    lacks_time_only = rate_hz is None and len(lacking) == 1 and nearest.columns["t"].name not in header
-    steps = "give the rate of the rows with --rate, " if lacks_time_only else ""
-    if has_quaternion:
-        steps += "compute yaw from the quaternion as atan2(2 (w z + x y), 1 - 2 (y^2 + z^2)), "
-    raise DataError(
-        f"{where} has no column {', '.join(lacking)}{hint}; it holds {', '.join(header)}; "
-        f"{steps}say which column is which with carlab import --mapping FILE.toml, or add the column."
-    )
+def conversions(mapping: ColumnMapping) -> str:
+    """The conversions that a mapping declares, as a list in words."""
+    conversions = []
+    for channel, source in mapping.columns.items():
+        factor = source.factor(channel)
+        if factor != 1.0 or source.neutral or source.name != channel:
+            column = f"'{source.name}'" if not source.neutral else f"('{source.name}' - {source.neutral:g})"
+            conversions.append(f"{channel} from {column}" + ("" if factor == 1.0 else f" times {factor:.6g}"))
+    if mapping.velocity_frame == "world":
+        conversions.append("velocities rotated from the world into the body frame")
+    if mapping.swap_xy:
+        conversions.append("x and y swapped")
+    if mapping.yaw_offset_rad:
+        conversions.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
+    if mapping.repair_yaw_rate:
+        conversions.append("wrap spikes of yaw_rate repaired from the pose")
+    if mapping.throttle_gate:
+        conversions.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
+    if mapping.command_lag_s:
+        conversions.append(f"commands shifted {mapping.command_lag_s * 1e3:.0f} ms earlier")
+    if mapping.clock == "even":
+        conversions.append("stamps of an even clock in place of the recorded ones")
+    if mapping.dead_reckoning:
+        conversions.append("pose integrated from speed and turn rate")
+    return ", ".join(conversions) if conversions else "nothing needed conversion"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carlab.recording.mcap.source import read_episode
 from tests.cli.test_bad_input import canonical_csv, write
 from tests.helpers.command_line import Carlab
 
@@ -19,13 +20,27 @@ def test_throttle_in_per_cent_has_the_scale_of_per_cent(carlab: Carlab, tmp_path
     assert "for example --throttle-scale 0.01." in text
 
 
-def test_pulse_widths_need_a_centre_and_get_no_scale(carlab: Carlab, tmp_path: Path) -> None:
+def test_pulse_widths_need_a_neutral_one_and_a_scale(carlab: Carlab, tmp_path: Path) -> None:
     path, data = canonical_csv(tmp_path)
-    data[:, 7] = 1500.0 + 400.0 * np.sin(data[:, 0])
+    steering = 0.8 * np.sin(data[:, 0])
+    data[:, 7] = 1500.0 + 500.0 * steering
     code, text = carlab("import", write(path, data))
     assert code == 1
-    assert "pulse widths in microseconds: replace them in the file by (pulse - centre) / range" in text
-    assert "--steering-scale" not in text
+    assert "pulse widths in microseconds: give the neutral one and the scale" in text
+    assert "--steering-neutral 1500 --steering-scale 0.002." in text
+    code, text = carlab("import", path, "--steering-neutral", "1500", "--steering-scale", "0.002")
+    assert code == 0, text
+    assert "steering from ('steering' - 1500) times 0.002" in text
+    np.testing.assert_allclose(read_episode(path.with_suffix(".mcap")).sent[:, 0], steering[:-1], atol=1e-9)
+
+
+def test_only_commands_have_a_neutral_value(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    mapping = tmp_path / "columns.toml"
+    mapping.write_text('[columns]\nx = "x"\n[columns.yaw]\nname = "yaw"\nneutral = 0.5\n')
+    code, text = carlab("import", write(path, data), "--mapping", mapping)
+    assert code == 2
+    assert "yaw has no neutral value; only steering and throttle have one." in text
 
 
 @pytest.mark.parametrize("largest", [1850.0, 35.03, 3.0])

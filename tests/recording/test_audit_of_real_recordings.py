@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from carlab.recording.audit.report import Severity
-from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.layouts import CANONICAL, DART, ETH
 
 
 def test_exported_real_recording_is_read_back_in_the_canonical_layout(shared, tmp_path):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from carlab.recording.audit.report import Severity
-from carlab.recording.column_mapping import CANONICAL
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.faults.clock_offset import clock_offset
 from carlab.recording.faults.commands import grid_motion
 from carlab.recording.faults.robust import held_at
+from carlab.recording.layouts import CANONICAL
 from carlab.recording.pose_velocity import pose_motion
 
 

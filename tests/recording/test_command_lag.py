@@ -4,8 +4,8 @@ import foreign_drive as foreign
 import numpy as np
 import pytest
 
-from carlab.recording.column_mapping import CANONICAL
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.layouts import CANONICAL
 
 PERIOD_S = 0.025
 LATE_ROWS = 40

@@ -9,10 +9,10 @@ import pytest
 
 from carlab.core.angles import wrap
 from carlab.recording.audit.report import Finding, RefusedError, Severity
-from carlab.recording.column_mapping import CANONICAL, ETH
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.pose import rows_off_path
+from carlab.recording.layouts import CANONICAL, ETH
 from carlab.recording.pose_velocity import pose_jumps
 
 RNG = np.random.default_rng(5)

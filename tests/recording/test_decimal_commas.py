@@ -74,7 +74,7 @@ def test_ambiguous_commas_are_refused(tmp_path: Path, first: str, second: str) -
 def test_text_with_commas_leaves_decimal_points_alone(tmp_path: Path) -> None:
     read = read_csv(write(tmp_path / "a.csv", [["0.5", "3,4"]] * 3, header="a,b"))
     np.testing.assert_array_equal(read.column("a"), [0.5] * 3)
-    assert not read.has_decimal_commas
+    assert not read.note
     assert set(read.texts) == {"b"}
 
 

@@ -4,11 +4,11 @@ import foreign_drive as foreign
 import numpy as np
 import pytest
 
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.recording.audit.report import RefusedError
-from carlab.recording.column_mapping import CANONICAL, recognise_layout
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.csv.repairing_import import import_repaired
+from carlab.recording.layouts import CANONICAL, recognise_layout
 
 MOTIVE = """Format Version,1.23,Take Name,Take 1,Export Frame Rate,120.000000,Rotation Type,Quaternion
 
@@ -38,17 +38,49 @@ def joined_topics(n_rows=400):
 
 @pytest.mark.parametrize("options", [{}, {"missing": "drop"}])
 def test_rows_of_different_topics_have_another_remedy_than_dropping_all_rows(tmp_path, options):
-    path = foreign.write(tmp_path / "bag.csv", joined_topics())
+    columns = joined_topics()
+    path = foreign.write(tmp_path / "bag.csv", columns)
     with pytest.raises(RefusedError) as error:
         import_csv(path, mapping=CANONICAL.with_options(**options))
     text = str(error.value)
     assert "Only 0 of 400 rows have a number in each of t, x, y, yaw" in text
     assert "messages of different topics" in text
-    assert "merge_asof" in text
     assert "--missing drop" not in text
+    assert error.value.findings[0].option == "--missing hold"
     assert len(error.value.findings) == 1
-    with pytest.raises(RefusedError, match="messages of different topics"):
-        import_repaired(path)
+    repaired = import_repaired(path, mapping=CANONICAL.with_options(**options))
+    assert [finding.id for finding in repaired.repaired] == ["joined_messages"]
+    poses = np.arange(2, 400, 2)  # between the first and the last command
+    np.testing.assert_allclose(repaired.episode.times_s, columns["t"][poses] - columns["t"][2], atol=1e-9)
+    np.testing.assert_array_equal(repaired.episode.states[:, 0], columns["x"][poses])
+    np.testing.assert_array_equal(repaired.episode.sent[:, 1], columns["throttle"][poses - 1][:-1])
+
+
+def test_values_are_held_by_the_mapped_columns_and_all_others(tmp_path):
+    columns = joined_topics(60)
+    columns["t"][30] = np.nan
+    columns["battery"] = np.where(np.arange(60) % 20 == 0, 7.0 + np.arange(60) / 60.0, np.nan)
+    path = foreign.write(tmp_path / "bag.csv", columns)
+    imported = import_csv(path, mapping=CANONICAL.with_options(missing="hold"))
+    poses = np.setdiff1d(np.arange(2, 60, 2), [30])
+    np.testing.assert_array_equal(imported.episode.states[:, 0], columns["x"][poses])
+    np.testing.assert_allclose(imported.episode.extra["battery"], 7.0 + 20 * (poses // 20) / 60.0, rtol=1e-12)
+    (held,) = [finding for finding in imported.report.findings if finding.id == "held_values"]
+    assert held.evidence["max_age_s"] == pytest.approx(1.0 / 60.0, abs=1e-4)
+
+
+def test_poses_without_commands_at_the_same_time_are_refused(tmp_path):
+    columns = joined_topics(60)
+    for name in ("steering", "throttle"):
+        columns[name][6:] = np.nan
+    path = foreign.write(tmp_path / "bag.csv", columns)
+    with pytest.raises(DataError, match=r"bag.csv has 2 poses between the first and the last number of each mapped"):
+        import_csv(path, mapping=CANONICAL.with_options(missing="hold"))
+
+
+def test_held_values_need_times():
+    with pytest.raises(ConfigError, match="Held values need times"):
+        CANONICAL.with_options(missing="hold", rate_hz=30.0)
 
 
 def test_rows_without_a_pose_are_no_other_topic(tmp_path):

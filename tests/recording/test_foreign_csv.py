@@ -8,9 +8,10 @@ import pytest
 
 from carlab.core.errors import ConfigError, DataError
 from carlab.recording.audit.report import Severity
-from carlab.recording.column_mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
+from carlab.recording.column_mapping import ColumnMapping, ColumnSource, load_mapping
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.csv.repairing_import import import_repaired
+from carlab.recording.layouts import CANONICAL, DART, ETH
 
 EVEN = np.arange(900) / 30.0
 

@@ -9,15 +9,18 @@ import json
 import foreign_drive as foreign
 import numpy as np
 import pytest
+import ros_bags
 from mcap.writer import Writer
 
 from carlab.core.errors import CarlabError
+from carlab.recording.column_mapping import load_mapping
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.mcap import schemas as schemas
 from carlab.recording.mcap.messages import ended_to_metadata, started_to_metadata
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.recorder import Recorder
+from carlab.recording.ros.bag_import import import_bag
 from tests.helpers.episode_documents import make_documents
 
 CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "true", "x", '"', "9" * 400, "\x00", "1,2", "0x1f"]
@@ -155,3 +158,23 @@ class TestMcap:
         assert message is not None
         assert "statistics are not a mapping" in message
         assert str(path) in message
+
+
+class TestRosBag:
+    @pytest.mark.parametrize("name", ["drive.bag", "drive.mcap", "drive_mcap", "drive_sqlite3"])
+    def test_damaged_bag_is_read_or_refused(self, name, tmp_path):
+        rng = np.random.default_rng(4)
+        whole = ros_bags.write_bag(tmp_path / name, foreign.drive(np.arange(60) / 30.0))
+        (tmp_path / "columns.toml").write_text(ros_bags.MAPPING)
+        mapping = load_mapping(tmp_path / "columns.toml")
+        files = sorted(whole.iterdir()) if whole.is_dir() else [whole]
+        contents = [file.read_bytes() for file in files]
+        refused = 0
+        for case in range(40):
+            chosen = case % len(files)
+            files[chosen].write_bytes(damaged(rng, contents[chosen]))
+            message = refusal(lambda path: import_bag(path, mapping=mapping), whole)
+            files[chosen].write_bytes(contents[chosen])
+            refused += message is not None
+            assert message is None or (whole.name in message and "\n" not in message), (case, message)
+        assert refused > 10

@@ -4,9 +4,9 @@ import foreign_drive as foreign
 import numpy as np
 import pytest
 
-from carlab.recording.column_mapping import CANONICAL
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.layouts import CANONICAL
 
 KEEP = CANONICAL.with_options(gaps="keep")
 SPLIT = CANONICAL.with_options(gaps="split")

@@ -8,9 +8,9 @@ import pytest
 
 from carlab.core.errors import ConfigError
 from carlab.recording.audit.report import Severity
-from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.faults import robust
+from carlab.recording.layouts import CANONICAL, DART_ONBOARD
 from carlab.recording.pose_velocity import pose_motion
 from sim_backends.array_ops import FLOATS
 from sim_backends.measurement import windowed

@@ -8,8 +8,9 @@ import pytest
 
 import carlab
 from carlab.core.errors import ConfigError, DataError
-from carlab.recording.column_mapping import CANONICAL, DART_ONBOARD, load_mapping, recognise_layout
+from carlab.recording.column_mapping import load_mapping
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.layouts import CANONICAL, DART_ONBOARD, recognise_layout
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from carlab.recording.column_mapping import (
     UNITS,
     VELOCITY_CHANNELS,
     ColumnMapping,
+    ColumnSource,
 )
 from carlab.recording.faults.pose import frozen_rows, stale_rows
 from carlab.recording.faults.robust import LAGS_S, correlation, fit_column
@@ -79,10 +80,9 @@ def _joined_messages_finding(values: Mapping[str, FloatArray]) -> Finding:
     whole = np.all(~np.isnan(np.stack(list(values.values()))), axis=0)
     sentence = (
         f"Only {whole.sum()} of {len(whole)} rows have a number in each of {', '.join(values)}: the rows are messages "
-        "of different topics; write one row for each pose, with the newest command before it (pandas.merge_asof, or "
-        "examples/join_logs.py)."
+        "of different topics; take the newest command before each pose with --missing hold."
     )
-    return Finding.at(~whole, "joined_messages", "pose, commands", Severity.ERROR, sentence)
+    return Finding.at(~whole, "joined_messages", "pose, commands", Severity.ERROR, sentence, option="--missing hold")
 
 
 def _cell_findings(
@@ -96,7 +96,8 @@ def _cell_findings(
     if is_too_large.any():
         row = int(np.argmax(is_too_large))
         offset_rad = mapping.yaw_offset_rad if channel == "yaw" else 0.0
-        cell = (column[row] - offset_rad) / (1.0 if source is None else source.factor(channel))
+        source = source or ColumnSource(channel)
+        cell = (column[row] - offset_rad) / source.factor(channel) + source.neutral
         example = f"{cell:.4g} in row {row + 1}"
     if bad.all():
         remedy = "remove it from the file" if channel in VELOCITY_CHANNELS else "repair the file"
@@ -333,8 +334,8 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
             if float(column.min()) >= MIN_PULSE:
                 option = None
                 remedy = (
-                    "these are pulse widths in microseconds: replace them in the file by (pulse - centre) / range, for "
-                    "example (pulse - 1500) / 500"
+                    "these are pulse widths in microseconds: give the neutral one and the scale, for example "
+                    f"--{channel}-neutral 1500 --{channel}-scale 0.002"
                 )
             sentence = (
                 f"Column '{name}' ({channel}) reaches {largest:.4g} where commands lie in [-1, 1], first in row "

@@ -1,8 +1,7 @@
-"""Import of a foreign CSV: converts units, signs and axes by the mapping, and audits the columns."""
+"""Import of a foreign table: converts units, signs and axes by the mapping, and audits the columns."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
+from carlab.core.hashes import sha256_of
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.audit import Channels, audit_channels, check_heading
@@ -22,14 +22,16 @@ from carlab.recording.column_mapping import (
     MAX_LAG_SHARE,
     VELOCITY_CHANNELS,
     ColumnMapping,
+    conversions,
     missing_columns,
-    recognise_layout,
 )
 from carlab.recording.csv.clocks import even_clock, with_rebuilt_clock
-from carlab.recording.csv.table import CsvTable, read_csv
+from carlab.recording.csv.held_values import with_held_values
+from carlab.recording.csv.table import ColumnTable, read_csv
 from carlab.recording.episode_builder import POSE_AGE
 from carlab.recording.faults.robust import held_at
 from carlab.recording.faults.stamps import gap_rows, segments
+from carlab.recording.layouts import recognise_layout
 from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
 SEGMENT = "segment"
@@ -65,22 +67,37 @@ class ImportedRecording:
 
 
 def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
-    """Import a .csv or .csv.gz file by the meaning of its columns, by default recognised by the header.
+    """Import a .csv or .csv.gz file as ``import_table`` does; by default the layout is recognised by the header.
+
+    Raises:
+        ConfigError: the mapping has an option for ROS bags.
+        DataError: the file is not a CSV, or ``import_table`` refuses its table.
+    """
+    if mapping is not None and mapping.message_times != "auto":
+        raise ConfigError("message_times is an option for ROS bags, and a CSV has a time column; remove it.")
+    return import_table(read_csv(path), mapping=mapping)
+
+
+def import_table(table: ColumnTable, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
+    """Import a table by the meaning of its columns.
 
     A command is sent at the time of its row and held until the next row: N rows give N states and N - 1 commands. The
     command of the last row is dropped. Times start at the first row. The row rate is unchanged.
 
     Raises:
-        DataError: the file is not a CSV, a column is missing, a cell is not a number, time does not increase or has
+        DataError: a column is missing, a cell is not a number, time does not increase or has
             gaps, undeclared units are evidently not SI, commands exceed [-1, 1], or the command lag is too long for
             the recording. Other findings are reported only.
     """
-    table = read_csv(path)
     source = table.path.name
     mapping, layout_note = _layout(table, mapping)
-    if table.has_decimal_commas:
-        layout_note += ", numbers with decimal commas"
-    values, extra, findings = _usable_rows(table, mapping)
+    if table.note:
+        layout_note += f", {table.note}"
+    findings: list[Finding] = []
+    if mapping.missing == "hold":
+        table, findings = with_held_values(table, mapping)
+    values, extra, new_findings = _usable_rows(table, mapping)
+    findings += new_findings
     origin_s = float(values["t"][0])
     t_s = values["t"] - origin_s
     findings += check_stamps(t_s, mapping)
@@ -102,7 +119,7 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     states, notes = _states(channels, mapping, spikes)
     metadata = {
         "source": str(table.path),
-        "source_sha256": hashlib.sha256(table.path.read_bytes()).hexdigest(),
+        "source_sha256": sha256_of(table.path),
         "layout": mapping.layout,
         "task": "recorded",
         "time_origin_s": repr(origin_s),
@@ -112,11 +129,11 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     }
     episodes, new_findings = _episodes(states, channels, mapping, metadata)
     findings += new_findings
-    announcement = f"{layout_note}; {_conversions(mapping)}."
+    announcement = f"{layout_note}; {conversions(mapping)}."
     return ImportedRecording(episodes, AuditReport(source, mapping.layout, tuple(findings)), mapping, announcement)
 
 
-def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMapping, str]:
+def _layout(table: ColumnTable, mapping: ColumnMapping | None) -> tuple[ColumnMapping, str]:
     """The mapping of the table and a note about its choice. Raises DataError if columns are missing."""
     source = table.path.name
     if mapping is None:
@@ -136,7 +153,7 @@ def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMappi
 
 
 def _usable_rows(
-    table: CsvTable, mapping: ColumnMapping
+    table: ColumnTable, mapping: ColumnMapping
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], list[Finding]]:
     """Channels, extra columns and findings of the rows with a number in each channel and an increasing stamp."""
     source = table.path.name
@@ -158,7 +175,9 @@ def _usable_rows(
     return usable_values, usable_extra, findings
 
 
-def _converted_columns(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def _converted_columns(
+    table: ColumnTable, mapping: ColumnMapping
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Channels converted to SI by the declared units, signs, axes and offset, and all other numeric columns."""
     values: dict[str, FloatArray] = {}
     if mapping.rate_hz is not None:
@@ -166,7 +185,7 @@ def _converted_columns(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[st
     for channel in CHANNELS:
         source = mapping.columns.get(channel)
         if source is not None and source.name in table.header and channel not in values:
-            values[channel] = table.column(source.name) * source.factor(channel)
+            values[channel] = source.values(channel, table.column(source.name))
     if mapping.swap_xy:
         values["x"], values["y"] = values["y"], values["x"]
         if mapping.velocity_frame == "world" and "vx" in values and "vy" in values:
@@ -179,7 +198,7 @@ def _converted_columns(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[st
     return values, extra
 
 
-def _text_column_findings(table: CsvTable, mapping: ColumnMapping) -> list[Finding]:
+def _text_column_findings(table: ColumnTable, mapping: ColumnMapping) -> list[Finding]:
     used = {source.name for source in mapping.columns.values()}
     return [
         Finding(
@@ -356,28 +375,3 @@ def _episode_rows(segment: FloatArray, mapping: ColumnMapping) -> tuple[list[sli
         tuple(part.start + 1 for part in isolated[:20]),
     )
     return parts, [finding]
-
-
-def _conversions(mapping: ColumnMapping) -> str:
-    conversions = []
-    for channel, source in mapping.columns.items():
-        factor = source.factor(channel)
-        if factor != 1.0 or source.name != channel:
-            conversions.append(f"{channel} from '{source.name}'" + ("" if factor == 1.0 else f" times {factor:.6g}"))
-    if mapping.velocity_frame == "world":
-        conversions.append("velocities rotated from the world into the body frame")
-    if mapping.swap_xy:
-        conversions.append("x and y swapped")
-    if mapping.yaw_offset_rad:
-        conversions.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
-    if mapping.repair_yaw_rate:
-        conversions.append("wrap spikes of yaw_rate repaired from the pose")
-    if mapping.throttle_gate:
-        conversions.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
-    if mapping.command_lag_s:
-        conversions.append(f"commands shifted {mapping.command_lag_s * 1e3:.0f} ms earlier")
-    if mapping.clock == "even":
-        conversions.append("stamps of an even clock in place of the recorded ones")
-    if mapping.dead_reckoning:
-        conversions.append("pose integrated from speed and turn rate")
-    return ", ".join(conversions) if conversions else "nothing needed conversion"

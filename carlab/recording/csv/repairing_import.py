@@ -9,12 +9,14 @@ from typing import Any
 
 from carlab.core.errors import DataError
 from carlab.recording.audit.report import Finding, RefusedError
-from carlab.recording.column_mapping import ColumnMapping, recognise_layout
+from carlab.recording.column_mapping import ColumnMapping
 from carlab.recording.csv.foreign import ImportedRecording, import_csv
 from carlab.recording.csv.table import read_csv
+from carlab.recording.layouts import recognise_layout
 
 _CHANNELS = ("x", "y", "yaw", "vx", "vy", "yaw_rate")
-_REPAIRS = {"gaps": "keep", "missing": "drop", "stamps": "drop"}
+_REPAIRS = {"gaps": ("keep",), "missing": ("drop", "hold"), "stamps": ("drop",)}
+"""Safe values of options; of another proposed value, the first one is used."""
 _MAX_ITERATIONS = 6
 
 
@@ -22,7 +24,8 @@ def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -
     """Import a CSV as ``import_csv`` does, and repair errors for which the audit proposes a safe option.
 
     Repairs: declares the units of pose and velocities, drops rows with a missing value or a stamp that does not
-    increase, and keeps gaps in time (``segment`` in ``extra`` numbers the parts between them).
+    increase, holds the values between messages of different topics, and keeps gaps in time (``segment`` in ``extra``
+    numbers the parts between them).
 
     Raises:
         DataError: the file cannot be read, or has an error without such a repair.
@@ -57,7 +60,7 @@ def _with_option(mapping: ColumnMapping, option: str) -> ColumnMapping | None:
         if part == "unit" and channel in _CHANNELS:
             columns[channel] = {"unit": value}
         elif name in _REPAIRS:
-            options[name] = _REPAIRS[name]
+            options[name] = value if value in _REPAIRS[name] else _REPAIRS[name][0]
         else:
             return None
     return mapping.with_options(columns=columns, **options)

@@ -1,4 +1,4 @@
-"""Reading of .csv and .csv.gz files into named columns; errors name the row and the column."""
+"""Tables of named columns, and the reading of .csv and .csv.gz files; errors name the row and the column."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _MISSING = frozenset({"", "none", "null", "na", "n/a"})
 
 
 @dataclass(frozen=True, slots=True)
-class CsvTable:
+class ColumnTable:
     """Numeric columns by name, each (N,), with NaN for empty cells. Row k of the arrays is data row k + 1.
 
     ``texts`` holds row and content of the first cell that is not a number, for each column with such a cell.
-    ``has_decimal_commas`` states whether numbers were read as 0,5.
+    ``note`` states how the numbers were read, for messages.
     """
 
     path: Path
     header: tuple[str, ...]
     columns: dict[str, FloatArray]
     texts: dict[str, tuple[int, str]]
-    has_decimal_commas: bool = False
+    note: str = ""
 
     @property
     def rows(self) -> int:
@@ -51,7 +51,7 @@ class CsvTable:
         return self.columns[name]
 
 
-def read_csv(path: Path | str) -> CsvTable:
+def read_csv(path: Path | str) -> ColumnTable:
     """Read a file with one header line, separated by commas, semicolons or tabs; ``.gz`` is decompressed.
 
     Empty lines, and lines before the header that begin with ``#``, are skipped. The header may begin with ``#``, as
@@ -106,7 +106,7 @@ def read_csv(path: Path | str) -> CsvTable:
     converted = with_decimal_points(texts, (cells[name] for name in columns)) if texts else {}
     columns |= {name: np.array(column, dtype=np.float64) for name, column in converted.items()}
     first_texts = {name: _first_text(column) for name, column in texts.items() if name not in converted}
-    return CsvTable(path, header, columns, first_texts, bool(converted))
+    return ColumnTable(path, header, columns, first_texts, "numbers with decimal commas" if converted else "")
 
 
 def _shortened(text: str) -> str:

@@ -1,0 +1,1 @@
+"""ROS bags: reading of messages, and their conversion to a table."""
