@@ -1,4 +1,4 @@
-"""The presets of the two public cars: loading by name, and the published numbers."""
+"""The presets of public cars: loading by name, and the published numbers."""
 
 import tomllib
 from importlib import resources
@@ -14,7 +14,7 @@ from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, CarState, Reality
 from sim_backends.car_parameters import SimulatorConfig
 
-CARS = ("eth_rc_car", "dart_jetracer", "dart_jetracer_linear")
+CARS = ("eth_rc_car", "dart_jetracer", "dart_jetracer_linear", "f1tenth")
 ALL_CARS = (*CARS, "eth_rc_car_effects")
 MEASURED_PARAMETERS = (
     "vehicle.mass",
@@ -41,7 +41,7 @@ def test_measured_parameters_are_fixed_and_unknown_ones_have_a_range(name):
     for parameter in MEASURED_PARAMETERS:
         assert parameter not in config.priors
     uncertain = {n for n in config.values() if n.startswith(("tyre.", "motor.", "steering."))} | {"vehicle.yaw_inertia"}
-    assert uncertain == set(config.priors)
+    assert uncertain == {n for n in config.priors if not n.startswith("effects.")}
     for low, high in config.priors.values():
         assert high > 1.5 * low
 
@@ -87,14 +87,35 @@ def test_preset_can_be_driven_as_a_simulated_car(name):
     assert state.yaw_rate_radps > 0.2
 
 
+def test_f1tenth_car_turns_and_holds_its_speed_as_published():
+    """Steady turn of the single-track model with the axle stiffness mu C_S load of f1tenth_gym."""
+    mass, front, rear, mu, stiffness = 3.74, 0.15875, 0.17145, 1.0489, (4.718, 5.4562)
+    speed, angle = 2.0, 0.1 * 0.4189
+    loads = [mass * 9.81 * arm / (front + rear) for arm in (rear, front)]
+    front_axle, rear_axle = (mu * slope * load for slope, load in zip(stiffness, loads, strict=True))
+    understeer = mass / (front + rear) ** 2 * (rear / front_axle - front / rear_axle)
+    states = []
+    with choose_car("f1tenth").car as car:
+        car.place(CarState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        car.arm()
+        for _ in range(160):
+            car.command(Action(0.1, speed / 5.04))
+            car.clock.sleep_until(car.clock.now_s() + 0.025)
+            states.append(car.observe().state)
+    settled = states[80:]
+    assert np.mean([s.vx_mps for s in settled]) == pytest.approx(speed, rel=0.01)
+    yaw_rate = speed * angle / (front + rear) / (1.0 + understeer * speed**2)
+    assert np.mean([s.yaw_rate_radps for s in settled]) == pytest.approx(yaw_rate, rel=0.02)
+
+
 def test_unknown_name_is_refused_with_the_available_names(capfd):
     with pytest.raises(
-        ConfigError, match="dart_jetracer, dart_jetracer_linear, eth_rc_car, eth_rc_car_effects, rc_car"
+        ConfigError, match="dart_jetracer, dart_jetracer_linear, eth_rc_car, eth_rc_car_effects, f1tenth, rc_car"
     ):
         load_car_file(Path("dart_jetracr"))
     with pytest.raises(
         ConfigError,
-        match=r"dart_jetracer, dart_jetracer_linear, eth_rc_car, eth_rc_car_effects, rc_car, or a FILE\.toml",
+        match=r"dart_jetracer, dart_jetracer_linear, eth_rc_car, eth_rc_car_effects, f1tenth, rc_car, or a FILE\.toml",
     ):
         choose_car("dart_jetracr")
     assert run(["replay", "nothing.csv", "--car", "dart_jetracr"]) == 2
