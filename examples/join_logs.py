@@ -34,7 +34,9 @@ def motive_poses(path: Path, body: str, up_axis: str) -> Array:
     settings = dict(zip(lines[0][::2], lines[0][1::2], strict=False)) if lines else {}
     if settings.get("Rotation Type") != "Quaternion" or settings.get("Length Units") != "Meters":
         raise SystemExit(f"{path}: export the take again with rotation type Quaternion and unit Meters.")
-    first = next(k for k, line in enumerate(lines) if line[:1] == ["Frame"])
+    first = next((k for k, line in enumerate(lines) if line[:1] == ["Frame"]), None)
+    if first is None:
+        raise SystemExit(f"{path} has no line 'Frame,Time (Seconds),...'; export the take again.")
     header = lines[1:first]
     types, names = (next(line for line in header if line[1:2] == [key]) for key in ("Type", "Name"))
     columns = {
@@ -48,7 +50,7 @@ def motive_poses(path: Path, body: str, up_axis: str) -> Array:
     keys = [("Position", axis) for axis in "XYZ"] + [("Rotation", axis) for axis in "XYZW"]
     rows = []
     for line in lines[first + 1 :]:
-        cells = [line[columns[key]] for key in keys]
+        cells = [line[columns[key]] if columns[key] < len(line) else "" for key in keys]  # the last line may be cut
         if not all(cells):
             continue
         x, y, z, *rotation = map(float, cells)

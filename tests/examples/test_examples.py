@@ -140,12 +140,20 @@ def test_join_reads_blank_lines_and_commands_in_any_order(join: Join) -> None:
     assert rows[:, 5] == pytest.approx(0.02 * np.arange(19))
 
 
+def test_join_leaves_out_a_cut_last_line(join: Join) -> None:
+    assert (
+        len(join(motive_take(POSES + "20,2.0,0,0,0,1,2"), "stamp_ns,servo_us,motor_us\n0,1500,1500\n3e9,1500,1500"))
+        == 20
+    )
+
+
 @pytest.mark.parametrize(
     ("files", "sentence"),
     [
         ({"take": motive_take("0,0.0,,,,,,,\n1,0.1,,,,,,,\n")}, r"take.csv: the cameras see 'car' in no frame\."),
         ({"take": None}, r"take.csv does not exist\."),
         ({"take": ""}, "export the take again"),
+        ({"take": motive_take("").replace("Frame,", "Number,")}, "no line 'Frame,Time .*export the take again"),
         ({"log": LOG.replace("servo_us", "servo")}, "log.csv has no column servo_us; edit the names"),
         ({"log": "stamp_ns,servo_us,motor_us\n"}, r"log.csv has no commands\."),
         ({"first_pose": "1.9"}, r"^1 poses lie between .* correct --first-pose\."),
