@@ -69,12 +69,52 @@ def test_values_are_held_by_the_mapped_columns_and_all_others(tmp_path):
     assert held.evidence["max_age_s"] == pytest.approx(1.0 / 60.0, abs=1e-4)
 
 
+def held(tmp_path, columns):
+    path = foreign.write(tmp_path / "bag.csv", columns)
+    return import_csv(path, mapping=CANONICAL.with_options(missing="hold"))
+
+
+def test_rows_of_topics_may_follow_each_other_and_have_equal_times(tmp_path):
+    """All poses precede all commands in the file; each command has the time of a pose."""
+    columns = joined_topics(60)
+    columns["t"][1::2] = columns["t"][0::2]
+    is_command = np.isfinite(columns["throttle"])
+    sorted_rows = np.argsort(is_command, kind="stable")
+    episode = held(tmp_path, {name: column[sorted_rows] for name, column in columns.items()}).episode
+    np.testing.assert_array_equal(episode.states[:, 0], columns["x"][0::2])
+    np.testing.assert_array_equal(episode.sent[:, 1], columns["throttle"][1::2][:-1])
+
+
+def test_incomplete_poses_get_no_older_coordinate_and_are_stated(tmp_path):
+    columns = joined_topics(60)
+    columns["y"][20] = columns["yaw"][30] = np.nan
+    imported = held(tmp_path, columns)
+    poses = np.setdiff1d(np.arange(2, 60, 2), [20, 30])
+    np.testing.assert_array_equal(imported.episode.states[:, 1], columns["y"][poses])
+    (finding,) = imported.report.of("held_values")
+    assert "; 3 poses that are incomplete, or before the first or after the last value" in finding.sentence
+
+
+def test_clock_that_starts_again_is_refused_if_values_are_held(tmp_path):
+    columns = joined_topics(60)
+    columns["t"][30:] -= columns["t"][30]
+    with pytest.raises(DataError, match=r"The times of the poses in bag.csv go back; sort its rows by time, or cut it"):
+        held(tmp_path, columns)
+
+
+def test_text_in_a_column_of_held_values_is_refused(tmp_path):
+    columns = {name: column.astype(object) for name, column in joined_topics(60).items()}
+    columns["steering"][7] = "left"
+    with pytest.raises(DataError, match=r"Row 8 of column 'steering' in bag.csv holds 'left', which is not a number"):
+        held(tmp_path, columns)
+
+
 def test_poses_without_commands_at_the_same_time_are_refused(tmp_path):
     columns = joined_topics(60)
     for name in ("steering", "throttle"):
         columns[name][6:] = np.nan
     path = foreign.write(tmp_path / "bag.csv", columns)
-    with pytest.raises(DataError, match=r"bag.csv has 2 poses between the first and the last number of each mapped"):
+    with pytest.raises(DataError, match=r"bag.csv has 2 poses between .* 'steering' has the fewest numbers \(3\)"):
         import_csv(path, mapping=CANONICAL.with_options(missing="hold"))
 
 
