@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from mcap_ros2.writer import Writer as McapWriter
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
@@ -111,3 +112,51 @@ def _write_foxglove(path: Path, drive: dict[str, np.ndarray], every: int, lead_n
             writer.write_message(topic, schemas[topic], content, stamp_ns + NETWORK_NS)
         writer.finish()
     return path
+
+
+def write_messages(path: Path, messages, definitions: dict[str, str] | None = None) -> Path:
+    """Write the folder of a ROS 2 bag from topic, type, time of reception [ns] and content of each message.
+
+    A content names some fields; the others are zero or empty. ``definitions`` are those of further or changed types.
+    """
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in {**ACKERMANN, **(definitions or {})}.items():
+        store.fielddefs.pop(name, None)
+        store.register(get_types_from_msg(text, name))
+    plugin = StoragePlugin.MCAP if path.name.endswith("mcap") else StoragePlugin.SQLITE3
+    connections = {}
+    with Rosbag2Writer(path, version=8, storage_plugin=plugin) as writer:
+        for topic, kind, received_ns, content in messages:
+            if (topic, kind) not in connections:
+                connections[topic, kind] = writer.add_connection(topic, kind, typestore=store)
+            message = store.serialize_cdr(_built(store, kind, content), kind)
+            writer.write(connections[topic, kind], received_ns, message)
+    return path
+
+
+def _built(store, kind, content):
+    fields = {name: _value(store, description, content.get(name)) for name, description in store.fielddefs[kind][1]}
+    return store.types[kind](**fields)
+
+
+def _value(store, description, content):
+    node, detail = description
+    if node == Nodetype.NAME:
+        return _built(store, detail, content or {})
+    if node == Nodetype.BASE:
+        return content if content is not None else "" if detail[0] == "string" else 0
+    element, size = detail
+    if element[0] == Nodetype.NAME:
+        return [_built(store, element[1], one) for one in content or []]
+    is_text = element[1][0] == "string"
+    return content or [] if is_text else np.array(content if content is not None else np.zeros(size), element[1][0])
+
+
+def header(stamp_ns: int) -> dict[str, dict[str, int]]:
+    """Content of a header."""
+    return {"stamp": dict(zip(("sec", "nanosec"), divmod(stamp_ns, 1_000_000_000), strict=True))}
+
+
+def pose(x: float, y: float, yaw: float) -> dict[str, dict[str, float]]:
+    """Content of geometry_msgs/Pose."""
+    return {"position": {"x": x, "y": y}, "orientation": {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}}

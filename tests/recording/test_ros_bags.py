@@ -79,13 +79,15 @@ def test_old_commands_give_a_warning(drive, mapping, tmp_path):
 @pytest.mark.parametrize(
     ("column", "text"),
     [
-        ("/drive/drive/steer", "/drive has no field 'steer'; in its place there is steering_angle, "),
-        ("/drive/drive", "/drive/drive is not a number; it has steering_angle, "),
-        ("/drive/drive/speed/x", "/drive has no field 'x'; in its place there is a number"),
+        ("/drive/drive/steer", r"/drive/drive has no field 'steer': .*AckermannDrive has the fields steering_angle, "),
+        ("/drive/drive", "/drive/drive is not a number: .*AckermannDrive has .*acceleration, jerk.$"),
+        ("/drive/drive/speed/x", "/drive/drive/speed has no field 'x': it is a number"),
         ("/driv/drive/speed", r"not a field of a topic .* \(is it '/drive'\?\), which has the topics /car/pose \("),
         ("speed", "not a field of a topic"),
         ("/drive/__class__", "not a field of a topic"),
-        ("/drive/drive[0]/speed", r"\[0\] chooses an element, but the field is not a list"),
+        ("/drive/drive[0]/speed", r"/drive/drive\[0\] is not an element of a list: .* has the fields"),
+        ("/drive/header/frame_id", "/drive/header/frame_id is not a number: it is a text"),
+        ("/drive", "'/drive' is a topic of drive_sqlite3; add a field of its messages, which have header, drive."),
     ],
 )
 def test_wrong_field_is_named_with_the_fields_that_exist(column, text, drive, mapping, tmp_path):
@@ -100,6 +102,13 @@ def test_bag_without_a_mapping_is_refused_with_its_topics(name, drive, tmp_path)
     path = ros_bags.write_bag(tmp_path / name, drive)
     with pytest.raises(ConfigError, match=r"topics /car/pose \(geometry_msgs/msg/PoseStamped, 900\), /drive \(.*180\)"):
         carlab.diagnose(path, carlab.load_car("rc_car"))
+
+
+def test_missing_library_has_the_installation_in_the_repository(drive, mapping, tmp_path, monkeypatch):
+    path = ros_bags.write_bag(tmp_path / "drive.bag", drive)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"needs the package rosbags; in the repository of carlab, run: .*\.\[ros\]"):
+        carlab.load(path, mapping=mapping)
 
 
 def test_columns_for_csv_do_not_fit_bags(drive, mapping, tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -78,8 +78,10 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     return import_table(read_csv(path), mapping=mapping)
 
 
-def import_table(table: ColumnTable, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
-    """Import a table by the meaning of its columns.
+def import_table(
+    table: ColumnTable, *, mapping: ColumnMapping | None = None, findings: Sequence[Finding] = ()
+) -> ImportedRecording:
+    """Import a table by the meaning of its columns. ``findings`` are those of its reading.
 
     A command is sent at the time of its row and held until the next row: N rows give N states and N - 1 commands. The
     command of the last row is dropped. Times start at the first row. The row rate is unchanged.
@@ -93,9 +95,10 @@ def import_table(table: ColumnTable, *, mapping: ColumnMapping | None = None) ->
     mapping, layout_note = _layout(table, mapping)
     if table.note:
         layout_note += f", {table.note}"
-    findings: list[Finding] = []
+    findings = list(findings)
     if mapping.missing == "hold":
-        table, findings = with_held_values(table, mapping)
+        table, new_findings = with_held_values(table, mapping)
+        findings += new_findings
     values, extra, new_findings = _usable_rows(table, mapping)
     findings += new_findings
     origin_s = float(values["t"][0])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,8 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.extras import install_hint
+from carlab.recording.ros.definitions import types_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -24,15 +25,8 @@ if TYPE_CHECKING:
 METADATA = "metadata.yaml"
 """File in the folder of a ROS 2 bag."""
 ENDINGS = (".bag", ".db3")
-_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
-_TYPE_NAME = re.compile(r"[a-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
-_ACKERMANN = {
-    "ackermann_msgs/msg/AckermannDrive": "\n".join(
-        f"float32 {name}" for name in ("steering_angle", "steering_angle_velocity", "speed", "acceleration", "jerk")
-    ),
-    "ackermann_msgs/msg/AckermannDriveStamped": "std_msgs/Header header\nackermann_msgs/AckermannDrive drive",
-}
-"""Definitions that neither the library nor older bags contain (ackermann_msgs 2.0, docs.ros.org)."""
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+"""First bytes of content that is compressed by zstd. A message of ROS 2 begins with a zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +68,25 @@ class Bag:
     def __init__(self, path: Path, reader: Rosbag1 | Rosbag2) -> None:
         self.path = path
         self._reader = reader
+        self._is_ros1 = path.suffix == ".bag"
         counts: dict[tuple[str, str], int] = {}
         for connection in reader.connections:
             key = connection.topic, connection.msgtype
+            if not all(isinstance(name, str) and name.isprintable() for name in key):
+                raise DataError(f"{path.name} has a topic or a type with the name {key!r}, which is no name of ROS.")
             counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(Topic(name, kind, n) for (name, kind), n in sorted(counts.items()))
+
+    def fields(self, topic: str) -> tuple[str, ...]:
+        """Names of the fields of the messages of a topic; empty without a definition.
+
+        Raises:
+            DataError: a definition cannot be read.
+        """
+        connections = self._connections({topic})
+        store = self._types(connections)
+        fields = [field for one in connections for field, _ in store.fielddefs.get(one.msgtype, ((), ()))[1]]
+        return tuple(dict.fromkeys(fields))
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
         """Decoded messages of the topics, in the order of the bag.
@@ -86,19 +94,30 @@ class Bag:
         Raises:
             DataError: a message cannot be read, or the bag lacks the definition of its type.
         """
-        names = set(topics)
-        connections = [connection for connection in self._reader.connections if connection.topic in names]
-        store = _types_of(self.path, connections)
+        connections = self._connections(set(topics))
+        store = self._types(connections)
         for connection in connections:
             if connection.msgtype not in store.fielddefs:
                 raise DataError(
                     f"{self.path.name} has no definition of {connection.msgtype} ({connection.topic}); convert it to "
                     "MCAP, which contains the definitions: ros2 bag convert."
                 )
-        decode = store.deserialize_ros1 if self.path.suffix == ".bag" else store.deserialize_cdr
+        decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
         with _faults_of(self.path):
             for connection, received_ns, content in self._reader.messages(connections):
-                yield Message(connection.topic, received_ns, decode(content, connection.msgtype))
+                if content[:4] == _ZSTD_MAGIC and not self._is_ros1:
+                    raise DataError(
+                        f"The messages of {self.path.name} are compressed; name the folder of the bag, in which "
+                        f"{METADATA} states the compression."
+                    )
+                yield Message(connection.topic, int(received_ns), decode(content, connection.msgtype))
+
+    def _connections(self, topics: Collection[str]) -> list[Connection]:
+        return [connection for connection in self._reader.connections if connection.topic in topics]
+
+    def _types(self, connections: Iterable[Connection]) -> Typestore:
+        with _faults_of(self.path):
+            return types_of(connections, is_ros1=self._is_ros1)
 
 
 @contextmanager
@@ -110,16 +129,24 @@ def opened_bag(path: Path) -> Iterator[Bag]:
         DataError: the bag cannot be read.
     """
     if importlib.util.find_spec("rosbags") is None:
-        raise ConfigError(f"{path.name} is a ROS bag, which needs the package rosbags; run: pip install 'carlab[ros]'")
+        raise ConfigError(f"{path.name} is a ROS bag, which needs the package rosbags; {install_hint('ros')}.")
     from rosbags.rosbag1 import Reader as Rosbag1
     from rosbags.rosbag2 import Reader as Rosbag2
 
+    _check_path(path)
     with ExitStack() as stack:
         with _faults_of(path):
             reader = Rosbag1(path) if path.suffix == ".bag" else Rosbag2(path)
             stack.enter_context(reader)
             bag = Bag(path, reader)
         yield bag
+
+
+def _check_path(path: Path) -> None:
+    """Raise DataError for a database whose path the library would read as another one."""
+    has_database = path.suffix == ".db3" or any(path.glob("*.db3"))
+    if has_database and any(character in str(path) for character in "#?%"):
+        raise DataError(f"The path {path} of a bag has one of the characters # ? %; rename the file or its folder.")
 
 
 @contextmanager
@@ -130,43 +157,9 @@ def _faults_of(path: Path) -> Iterator[None]:
     except DataError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        words = "".join(c if c.isprintable() else " " for c in str(error)).split()
+        reason = " ".join(words)[:200] or type(error).__name__
         raise DataError(
-            f"{path.name} cannot be read as a ROS bag ({reason[:200]}); record or copy it again, or run "
-            "'ros2 bag reindex' (ROS 1: 'rosbag reindex')."
+            f"{path.name} cannot be read as a ROS bag ({reason}); copy it again, or repair it: 'ros2 bag reindex', "
+            "'mcap recover' or 'rosbag reindex'."
         ) from error
-
-
-def _types_of(path: Path, connections: Iterable[Connection]) -> Typestore:
-    """Types of the messages: of the library, and those that the bag itself defines.
-
-    The library compiles definitions to Python code. Therefore only fields with plain names are passed to it, without
-    constants and default values.
-    """
-    from rosbags.interfaces import MessageDefinitionFormat
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.LATEST)
-    definitions: dict[str, Any] = {}
-    with _faults_of(path):
-        for name, text in _ACKERMANN.items():
-            definitions.update(get_types_from_msg(text, name))
-        for connection in connections:
-            if connection.msgdef.format is MessageDefinitionFormat.MSG:
-                definitions.update(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-            elif connection.msgdef.format is MessageDefinitionFormat.IDL:
-                definitions.update(get_types_from_idl(connection.msgdef.data))
-        for name, (_, fields) in definitions.items():
-            if name not in store.fielddefs:
-                _check_names(name, [field for field, _ in fields])
-                store.register({name: ([], fields)})
-    return store
-
-
-def _check_names(type_name: str, fields: Iterable[str]) -> None:
-    """Raise DataError if a type or a field has a name that ROS does not allow."""
-    if not _TYPE_NAME.fullmatch(type_name):
-        raise DataError(f"The bag defines a type with the name {type_name[:60]!r}, which is no name of ROS.")
-    for field in fields:
-        if not _NAME.fullmatch(field):
-            raise DataError(f"The bag defines {type_name} with the field {field[:60]!r}, which is no name of ROS.")

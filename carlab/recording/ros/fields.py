@@ -1,7 +1,8 @@
 """Numbers in ROS messages, addressed as in rqt_plot and PlotJuggler: ``/topic/field/field``.
 
 ``/poses/poses[car]/pose/position/x`` chooses the element of a list that has the text ``car`` in one of its own fields
-(a name or ``child_frame_id``); ``poses[0]`` chooses by position. ``/orientation/yaw`` is the yaw of a quaternion.
+(a name or ``child_frame_id``); ``poses[0]`` chooses by position, ``poses["0"]`` by the text 0. ``/orientation/yaw`` is
+the yaw of a quaternion.
 """
 
 from __future__ import annotations
@@ -10,14 +11,16 @@ import dataclasses
 import keyword
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from carlab.core.errors import DataError
 from mocap.axes import rotate
 
-_STEP = re.compile(r"/([A-Za-z]\w*)(?:\[([^\]]*)\])?")
+_STEP = re.compile(r"/([A-Za-z]\w*)(?:\[([^\]]+)\])?")
 _QUATERNION = ("x", "y", "z", "w")
 
 
@@ -28,84 +31,124 @@ class FieldPath:
     topic: str
     steps: tuple[tuple[str, str | None], ...]
 
+    def text(self, n_steps: int) -> str:
+        """The first steps as in the name of a column."""
+        steps = (f"/{name}" + ("" if key is None else f"[{key}]") for name, key in self.steps[:n_steps])
+        return self.topic + "".join(steps)
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A number of a message, and the newest stamp of a header on the way to it [ns]; None without a header."""
+    """A number of a message, and the stamp of the innermost header around it [ns]; None without a header."""
 
     value: float
     stamp_ns: int | None
 
 
-def field_path(column: str, topics: Iterable[str]) -> FieldPath | None:
-    """The path that a column name means; None if no topic begins it or the rest is not a path."""
-    owners = [topic for topic in topics if column.startswith(f"{topic}/")]
-    if not owners:
-        return None
-    topic = max(owners, key=len)
+class MissingElementError(Exception):
+    """A list of a message lacks the chosen element. The text states which elements it has."""
+
+
+def field_path(column: str, topic: str) -> FieldPath | None:
+    """The path that a column name means in the messages of a topic; None if it is no path of the topic."""
     rest = column.removeprefix(topic)
-    steps = tuple((name, key if bracket else None) for name, key, bracket in _steps(rest))
-    return FieldPath(topic, steps) if _STEP.sub("", rest) == "" else None
+    steps = tuple((match[1], match[2]) for match in _STEP.finditer(rest))
+    is_path = column.startswith(topic) and steps and _STEP.sub("", rest) == ""
+    return FieldPath(topic, steps) if is_path else None
 
 
-def _steps(rest: str) -> list[tuple[str, str, bool]]:
-    return [(match[1], match[2] or "", match[2] is not None) for match in _STEP.finditer(rest)]
-
-
-def sample(message: Any, path: FieldPath) -> Sample | None:
-    """The number at ``path``; None if a list lacks the chosen element.
+def sample(message: Any, path: FieldPath) -> Sample:
+    """The number at ``path``.
 
     Raises:
         DataError: the message has no such field, or the field is not a number.
+        MissingElementError: a list of the message lacks the chosen element.
     """
     stamp_ns: int | None = None
     value = message
-    for name, key in path.steps:
+    for k, (_, key) in enumerate(path.steps):
         stamp_ns = _header_stamp_ns(value) or stamp_ns
-        value = _field(value, name, path.topic)
+        value = _field(value, path, k)
         if key is not None:
-            value = _element(value, key)
-            if value is None:
-                return None
+            value = _element(value, path, k)
     if not isinstance(value, (bool, int, float)):
-        fields = ", ".join(_field_names(value)) or "no fields"
-        raise DataError(f"{_text(path)} is not a number; it has {fields}.")
+        raise DataError(f"{path.text(len(path.steps))} is not a number: {_description(value)}.")
     return Sample(float(value), stamp_ns)
 
 
-def _text(path: FieldPath) -> str:
-    steps = "".join(f"/{name}" + ("" if key is None else f"[{key}]") for name, key in path.steps)
-    return f"{path.topic}{steps}"
-
-
-def _field(message: Any, name: str, topic: str) -> Any:
+def _field(message: Any, path: FieldPath, k: int) -> Any:
+    """Field of a message by step ``k`` of the path, or the yaw of a quaternion."""
+    name = path.steps[k][0]
     names = _field_names(message)
-    if name == "yaw" and name not in names and set(_QUATERNION) <= set(names):
-        forward = rotate(tuple(getattr(message, axis) for axis in _QUATERNION), (1.0, 0.0, 0.0))
-        return math.atan2(forward[1], forward[0])
     attribute = f"{name}_" if keyword.iskeyword(name) else name
-    if attribute not in names:
-        raise DataError(f"{topic} has no field '{name}'; in its place there is {', '.join(names) or 'a number'}.")
-    return getattr(message, attribute)
+    if attribute in names:
+        return getattr(message, attribute)
+    components = [getattr(message, axis) for axis in _QUATERNION if axis in names]
+    is_quaternion = len(components) == len(_QUATERNION) and all(isinstance(c, (int, float)) for c in components)
+    if name == "yaw" and is_quaternion:
+        return _yaw_rad(components)
+    raise DataError(f"{path.text(k)} has no field '{name}': {_description(message)}.")
+
+
+def _yaw_rad(quaternion: Sequence[float]) -> float:
+    """Yaw of a quaternion (x, y, z, w) of any length [rad]; NaN if it is zero, as of a body that is not tracked."""
+    length = math.hypot(*quaternion)
+    if length == 0.0:
+        return math.nan
+    x, y, z, w = (component / length for component in quaternion)
+    forward = rotate((x, y, z, w), (1.0, 0.0, 0.0))
+    return math.atan2(forward[1], forward[0])
 
 
 def _field_names(message: Any) -> list[str]:
-    return [field.name for field in dataclasses.fields(message)] if dataclasses.is_dataclass(message) else []
+    if not dataclasses.is_dataclass(message):
+        return []
+    return [field.name for field in dataclasses.fields(message) if not field.name.startswith("_")]
 
 
-def _element(values: Any, key: str) -> Any:
-    """Element of a list by its position, or by a text in one of its own fields."""
-    if not isinstance(values, Sequence) and not hasattr(values, "tolist"):
-        raise DataError(f"[{key}] chooses an element, but the field is not a list; remove it.")
-    elements = values if isinstance(values, Sequence) else values.tolist()
+def _is_list(value: Any) -> bool:
+    return isinstance(value, (list, np.ndarray))
+
+
+def _description(value: Any) -> str:
+    """What a part of a message is, for messages of errors."""
+    if names := _field_names(value):
+        return f"{getattr(value, '__msgtype__', 'the message')} has the fields {', '.join(names)}"
+    if _is_list(value):
+        return f"it is a list of {len(value)} elements, of which [0] is the first one"
+    return "it is a text" if isinstance(value, str) else "it is a number"
+
+
+def _element(values: Any, path: FieldPath, k: int) -> Any:
+    """Element of a list by step ``k`` of the path: by its position, or by a text in one of its own fields."""
+    key = path.steps[k][1] or ""
+    if not _is_list(values):
+        raise DataError(f"{path.text(k + 1)} is not an element of a list: {_description(values)}.")
+    text = key.strip("\"'")
+    texts = [_texts(element) for element in values] if isinstance(values, list) else []
+    index = next((k for k, own in enumerate(texts) if text in own), None)
     if key.isdecimal():
-        return elements[int(key)] if int(key) < len(elements) else None
-    return next((e for e in elements if key in (getattr(e, name) for name in _field_names(e))), None)
+        if index is not None:
+            raise DataError(
+                f"{path.text(k + 1)} is the name of an element, and {key} may be the position of another one; write "
+                f'["{key}"] for the name.'
+            )
+        index = int(key) if int(key) < len(values) else None
+    if index is None:
+        names = ", ".join(dict.fromkeys(repr(name) for own in texts for name in own[:1]))
+        raise MissingElementError(f"{len(values)} elements" + (f" ({names[:200]})" if names else ""))
+    return values[index].item() if isinstance(values, np.ndarray) else values[index]
+
+
+def _texts(element: Any) -> list[str]:
+    """Texts in the own fields of a message."""
+    return [text for name in _field_names(element) if isinstance(text := getattr(element, name), str)]
 
 
 def _header_stamp_ns(message: Any) -> int | None:
     """Stamp of the header of a message [ns]; None without a header or with a stamp of zero."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
+    sec, nanosec = getattr(stamp, "sec", None), getattr(stamp, "nanosec", None)
+    if not (isinstance(sec, int) and isinstance(nanosec, int)):
         return None
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or None
+    return sec * 1_000_000_000 + nanosec or None
