@@ -173,7 +173,10 @@ def required_file(path: Path, what: str = "The recording") -> Path:
             )
         raise ConfigError(f"{what} '{path}' does not exist; check the path.")
     if path.is_dir() and not is_bag(path):
-        raise ConfigError(f"{what} '{path}' is a folder; name a file in it (a run has episodes/0001.mcap).")
+        raise ConfigError(
+            f"{what} '{path}' is a folder; name a file in it (a run has episodes/0001.mcap). The folder of a ROS 2 bag "
+            "needs its metadata.yaml, which 'ros2 bag reindex' writes."
+        )
     return path
 
 

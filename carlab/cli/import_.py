@@ -105,7 +105,7 @@ class Import:
     """Factor on steering, to bring it into [-1, 1]."""
 
     steering_neutral: float | None = None
-    """Content of the column without steering, for example 1500 for pulse widths in microseconds."""
+    """Content of the column for the command 0, for example 1500 for pulse widths in microseconds."""
 
     throttle_sign: Sign | None = None
     """-1 if positive throttle drives backwards."""
@@ -114,7 +114,7 @@ class Import:
     """Factor on throttle, to bring it into [-1, 1]."""
 
     throttle_neutral: float | None = None
-    """Content of the column without throttle."""
+    """Content of the column for the command 0."""
 
     yaw_offset_rad: Annotated[float | None, arg(name="yaw-offset")] = None
     swap_xy: bool | None = None
@@ -139,7 +139,7 @@ class Import:
         if not is_foreign(self.recording):
             raise ConfigError(
                 f"{self.recording} is neither a CSV nor a ROS bag; name a .csv, .csv.gz, .bag or .db3 file, an .mcap "
-                "file of ROS, or the folder of a ROS 2 bag (with metadata.yaml)."
+                "file of ROS 2, or the folder of a ROS 2 bag (with metadata.yaml)."
             )
         out = self.out if self.out is not None else self._default_out()
         new_file(out, "--out", ".mcap")
@@ -173,10 +173,10 @@ class Import:
 
     def _default_out(self) -> Path:
         """Path of the MCAP file beside the recording; for an MCAP of ROS, with another name."""
-        name = self.recording.resolve().name
-        stem = name if self.recording.is_dir() else name.removesuffix(".gz").rpartition(".")[0]
-        ending = "_carlab.mcap" if name.endswith(".mcap") else ".mcap"
-        return self.recording.with_name(f"{stem}{ending}")
+        recording = self.recording if self.recording.name not in ("", "..") else self.recording.resolve()
+        stem = recording.name if recording.is_dir() else recording.name.removesuffix(".gz").rpartition(".")[0]
+        ending = "_carlab.mcap" if recording.name.endswith(".mcap") else ".mcap"
+        return recording.with_name(f"{stem}{ending}")
 
     def _write_report(self, report: AuditReport) -> None:
         if self.report is not None:

@@ -132,7 +132,7 @@ class ColumnMapping:
     """Time stamps that do not increase: ``error``, or ``drop`` those rows."""
     message_times: Literal["auto", "header", "received"] = "auto"
     """Times of the messages of a ROS bag: of their ``header``, or at which the recorder ``received`` them. ``auto``: of
-    the header, except for topics without a header or with a clock of their own."""
+    the header, except for topics without a header or whose headers have another clock, as in a simulation."""
 
     def __post_init__(self) -> None:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
