@@ -28,8 +28,10 @@ from carlab.diagnosis.final_models import (
 from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, Withdrawal, final_model_name
 from carlab.diagnosis.identification.held_out_errors import HeldOut, mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
+from carlab.diagnosis.identification.velocity_filter import VelocityFilter
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.limits import effect_limits
+from carlab.diagnosis.measured_filter import FILTER, measured_filter, name_filter, with_filter
 from carlab.diagnosis.naming import (
     NamingResult,
     accept_names,
@@ -128,8 +130,10 @@ def diagnose(
     decisions: list[Decision] = []
     with FunctionWorkers() if workers is None else nullcontext(workers) as shared:
         control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, shared)
-        recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
-        accepted, scored, naming = _search_effects(recordings, noise, request, control, timer)
+        recordings, faults = _prepare_recordings(fit, held_out, request, progress)
+        measured = measured_filter(recordings.fit_segments, nominal)
+        recordings, noise = _estimate_noise(recordings, with_filter(nominal, measured))
+        accepted, scored, naming = _search_effects(recordings, noise, measured, request, control, timer)
         withdrawn = withdrawn_effects(decisions, accepted, scored.found.effects)
         outcome = _assemble_result(scored, naming, withdrawn, recordings, replace(request, data_faults=faults), control)
     return _with_run(outcome, timer, effects or (), None if held_out else share, decisions)
@@ -151,8 +155,8 @@ def _with_run(
 
 def _prepare_recordings(
     fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], request: Request, progress: Progress
-) -> tuple[SplitRecordings, Noise, tuple[DataFault, ...]]:
-    """Repair faults, split the recordings, cut them into windows, and estimate their noise."""
+) -> tuple[SplitRecordings, tuple[DataFault, ...]]:
+    """Repair faults, split the recordings, and cut them into windows."""
     settings = request.settings.windows
     nominal = request.nominal
     progress("reading", 0.0)
@@ -178,8 +182,7 @@ def _prepare_recordings(
         raise
     if request.ceiling or request.discrepancy:
         check_duration(recordings.fit_segments, EnsembleSettings())
-    recordings, noise = _estimate_noise(recordings, nominal)
-    return recordings, noise, faults
+    return recordings, faults
 
 
 def _estimate_noise(recordings: SplitRecordings, nominal: SimulatorConfig) -> tuple[SplitRecordings, Noise]:
@@ -194,17 +197,29 @@ def _estimate_noise(recordings: SplitRecordings, nominal: SimulatorConfig) -> tu
 
 
 def _search_effects(
-    recordings: SplitRecordings, noise: Noise, request: Request, control: RunControl, timer: SearchTimer
+    recordings: SplitRecordings,
+    noise: Noise,
+    measured: VelocityFilter | None,
+    request: Request,
+    control: RunControl,
+    timer: SearchTimer,
 ) -> tuple[tuple[str, ...], ScoredSearch, NamingResult]:
     """Search for effects, withdraw spurious ones, and score the result on held-out windows.
 
-    Also returns the effects that the search accepted.
+    A ``measured`` filter of the velocities is in the simulator of the search and is named afterwards, if it is a
+    candidate. Also returns the effects that the search accepted.
     """
     control = replace(control, progress=timer.progress(control.progress))
-    windows, nominal = recordings.fit_windows, request.nominal
+    windows, nominal = recordings.fit_windows, with_filter(request.nominal, measured)
     floor = mean_noise_floor(windows, noise, nominal)
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
-    problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
+    is_named = measured is not None and FILTER in candidates
+    if is_named:
+        candidates = tuple(name for name in candidates if name != FILTER)
+    searched = nominal if is_named else request.nominal
+    problem = SearchProblem(
+        searched, windows, floor, noise.measured, confusable_effects(), candidates, request.settings
+    )
     search_control = control.part(*SEARCH_PROGRESS)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
@@ -222,6 +237,9 @@ def _search_effects(
         scored = without_uncertain_effects(scored, search_control)
         if scored.found.effects != naming.found.effects:
             naming = with_fewer_effects(problem, naming, scored.found, search_control)
+    if measured is not None and is_named:
+        problem, naming = name_filter(problem, request.nominal, replace(naming, found=scored.found), measured)
+        scored = ScoredSearch.of(problem, naming.found, held_out)
     timer.end_checks()
     return found.effects, scored, naming
 

@@ -82,6 +82,17 @@ class IdentificationSettings:
     """Maximum width [s] of a velocity window, as a box."""
     velocity_z_min: float = 3.0
     """Minimum variance of the velocity window [standard errors]."""
+    filter_ratio_min: float = 1.2
+    """Minimum ratio of the unexplained variances of the velocities without and with a filter, both with a dead time.
+    Without a filter it is 1.00 in recordings of the ETH and the DART car and in simulated ones."""
+    filter_channel_ratio_min: float = 1.05
+    """The same for each channel, because a filter of the velocities acts on all of them."""
+    filter_change_min_s: float = 0.005
+    """[s] Minimum difference of a measured time constant from that of the car file, or from 0."""
+    filter_smoothing_s: float = 0.08
+    """[s] Standard deviation of the Gaussian that smooths velocities before the comparison: motion below 2 Hz."""
+    filter_min_rows: int = 200
+    """Minimum number of moving rows for this comparison."""
     curve_std: float = 10.0
     """Prior standard deviation of a measured curve's deviations, in typical sizes: keeps knots without data at 0."""
     curve_roughness_std: float = 1.0

@@ -136,7 +136,7 @@ def fit_column(
     mean_square = float(np.mean(target**2)) + 1e-18
 
     def fit(filtered: FloatArray, lag_s: float) -> tuple[float, float]:
-        scale, cost = _trimmed_scale(np.interp(t_s[compared] - lag_s, t_s, filtered), target)
+        scale, cost = trimmed_scale(np.interp(t_s[compared] - lag_s, t_s, filtered), target)
         return cost / mean_square, scale
 
     best = (math.inf, 0.0, 0.0, reference)
@@ -153,7 +153,7 @@ def fit_column(
     return ColumnFit(scale, lag, unexplained, fit(reference, 0.0)[0], math.sqrt(mean_square), prediction)
 
 
-def _trimmed_scale(reference: FloatArray, column: FloatArray) -> tuple[float, float]:
+def trimmed_scale(reference: FloatArray, column: FloatArray) -> tuple[float, float]:
     """Least-squares scale of the ``KEPT_SHARE`` of rows that fit best, and the mean square that it leaves."""
     keep = np.ones(len(column), dtype=bool)
     scale = 0.0

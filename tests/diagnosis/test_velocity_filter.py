@@ -1,0 +1,127 @@
+"""Filters of recorded velocities are measured against the poses, whatever the simulator lacks."""
+
+from dataclasses import replace
+
+import foreign_drive as foreign
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import carlab
+from carlab.core.episode_data import EpisodeData
+from carlab.diagnosis.identification.velocity_filter import velocity_filter
+from carlab.diagnosis.measured_filter import FILTER, measured_filter
+from carlab.prediction.windows import segments_of
+from sim_backends import SimulatorConfig
+
+PERIOD_S = 1.0 / 30.0
+TIMES_S = np.arange(1800) * PERIOD_S
+POSE_STD = np.array([0.0003, 0.0003, 0.002])
+VELOCITY_STD = np.array([0.01, 0.01, 0.03])
+
+
+def filtered_velocities(time_constant_s: float, dead_time_s: float = 0.0) -> np.ndarray:
+    """Velocities (N, 3) of the drive in closed form behind a first-order filter, integrated by scipy."""
+
+    def true(t):
+        later = t - dead_time_s
+        return np.array([foreign.speed(later), 0.3 * np.sin(2.0 * later), foreign.yaw_rate(later)])
+
+    if time_constant_s == 0.0:
+        return true(TIMES_S).T
+    solution = solve_ivp(
+        lambda t, v: (true(t) - v) / time_constant_s,
+        (0.0, TIMES_S[-1]),
+        true(0.0),
+        t_eval=TIMES_S,
+        rtol=1e-8,
+        atol=1e-10,
+    )
+    return solution.y.T
+
+
+def episode(velocities: np.ndarray, seed: int = 0) -> EpisodeData:
+    """A recording of the drive with noise. Poses are integrated from the true velocities."""
+    rng = np.random.default_rng(seed)
+    fine = np.arange(TIMES_S[-1] / 1e-3 + 1) * 1e-3
+    vx, vy = foreign.speed(fine), 0.3 * np.sin(2.0 * fine)
+    yaw = foreign.yaw(fine)
+    rates = np.stack([vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw)])
+    steps = 0.5e-3 * (rates[:, 1:] + rates[:, :-1])
+    path = np.concatenate([np.zeros((2, 1)), np.cumsum(steps, axis=1)], axis=1)
+    pose = np.stack(
+        [np.interp(TIMES_S, fine, path[0]), np.interp(TIMES_S, fine, path[1]), foreign.yaw(TIMES_S)], axis=1
+    )
+    pose = pose + POSE_STD * rng.standard_normal(pose.shape)
+    drive = foreign.drive(TIMES_S)
+    commands = np.column_stack([drive["steering"], drive["throttle"]])[:-1]
+    states = np.column_stack([pose, velocities + VELOCITY_STD * rng.standard_normal(velocities.shape)])
+    return EpisodeData(
+        times_s=TIMES_S,
+        states=states,
+        requested=commands,
+        sent=commands,
+        rewards=np.zeros(len(commands)),
+        poses=np.column_stack([TIMES_S, pose]),
+    )
+
+
+@pytest.mark.parametrize("time_constant_s", [0.05, 0.1, 0.2])
+def test_time_constant_is_measured(time_constant_s):
+    found = velocity_filter(segments_of([episode(filtered_velocities(time_constant_s))]))
+    assert found is not None
+    assert found.time_constant_s == pytest.approx(time_constant_s, rel=0.03, abs=0.002)
+
+
+@pytest.mark.parametrize("dead_time_s", [0.0, 0.5 * PERIOD_S, PERIOD_S, 2.0 * PERIOD_S])
+@pytest.mark.parametrize("seed", range(5))
+def test_velocities_with_a_dead_time_alone_have_no_filter(dead_time_s, seed):
+    assert velocity_filter(segments_of([episode(filtered_velocities(0.0, dead_time_s), seed)])) is None
+
+
+def test_filter_of_one_velocity_is_no_filter_of_the_recording():
+    velocities = filtered_velocities(0.0)
+    velocities[:, 2] = filtered_velocities(0.1)[:, 2]
+    assert velocity_filter(segments_of([episode(velocities)])) is None
+
+
+def test_short_recording_has_no_measured_filter():
+    whole = episode(filtered_velocities(0.1))
+    short = replace(
+        whole,
+        times_s=whole.times_s[:150],
+        states=whole.states[:150],
+        requested=whole.requested[:149],
+        sent=whole.sent[:149],
+        rewards=whole.rewards[:149],
+        poses=whole.poses[:150],
+    )
+    assert velocity_filter(segments_of([short])) is None
+
+
+def test_filter_of_the_car_file_is_not_measured_again():
+    segments = segments_of([episode(filtered_velocities(0.1))])
+    nominal = SimulatorConfig()
+    assert measured_filter(segments, nominal) is not None
+    assert measured_filter(segments, replace(nominal, effects={FILTER: {"time_constant": 0.1}})) is None
+    assert measured_filter(segments, replace(nominal, effects={FILTER: {"time_constant": 0.05}})) is not None
+
+
+def test_filter_is_named_although_the_simulator_is_wrong():
+    """The motion of this drive is kinematic and not that of the simulator, whose error is far above the noise."""
+    report = carlab.diagnose(
+        episode(filtered_velocities(0.1)), carlab.load_car("rc_car"), effects=[FILTER, "command_delay"], budget_s=30.0
+    )
+    assert next(iter(report.effects)) == FILTER
+    estimate = report.effects[FILTER].parameters["time_constant"]
+    assert estimate.low90 < 0.1 < estimate.high90
+    assert report.diagnosis.held_out["with_effects"].score > 3.0
+    assert report.effects[FILTER].indistinguishable_from == ()
+    assert report.model.simulator.effects[FILTER]["time_constant"] == pytest.approx(estimate.value)
+
+
+def test_filter_is_not_named_if_it_was_not_requested():
+    report = carlab.diagnose(
+        episode(filtered_velocities(0.1)), carlab.load_car("rc_car"), effects=["command_delay"], budget_s=30.0
+    )
+    assert FILTER not in report.effects
