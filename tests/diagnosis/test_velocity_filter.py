@@ -66,7 +66,7 @@ def episode(velocities: np.ndarray, seed: int = 0) -> EpisodeData:
     )
 
 
-@pytest.mark.parametrize("time_constant_s", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("time_constant_s", [0.1, 0.15, 0.2])
 def test_time_constant_is_measured(time_constant_s):
     found = velocity_filter(segments_of([episode(filtered_velocities(time_constant_s))]))
     assert found is not None
@@ -82,6 +82,12 @@ def test_velocities_with_a_dead_time_alone_have_no_filter(dead_time_s, seed):
 def test_filter_of_one_velocity_is_no_filter_of_the_recording():
     velocities = filtered_velocities(0.0)
     velocities[:, 2] = filtered_velocities(0.1)[:, 2]
+    assert velocity_filter(segments_of([episode(velocities)])) is None
+
+
+def test_velocity_that_does_not_follow_the_poses_has_no_filter():
+    velocities = filtered_velocities(0.1)
+    velocities[:, 1] += 0.3 * np.sin(5.0 * TIMES_S)
     assert velocity_filter(segments_of([episode(velocities)])) is None
 
 

@@ -20,6 +20,7 @@ from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.windows import RecordingSegment
 from carlab.recording.faults.robust import first_order_lag, parabola_minimum, trimmed_scale
 from carlab.recording.faults.settings import LIMITS
+from carlab.recording.pose_velocity import BoolArray
 
 VELOCITIES = range(3, 6)
 """Columns of the state: vx, vy, yaw rate."""
@@ -51,7 +52,7 @@ class _Velocity:
 
     recorded: FloatArray
     of_pose: FloatArray
-    moving: FloatArray
+    moving: BoolArray
     period_s: float
 
     def filtered(self, time_constant_s: float) -> FloatArray:
@@ -67,10 +68,12 @@ def velocity_filter(segments: Sequence[RecordingSegment]) -> VelocityFilter | No
     grid = np.array([[_unexplained_shares(channel, tau) for tau in TIME_CONSTANTS_S] for channel in channels])
     cost = np.log(grid).mean(axis=0)  # (time constants, dead times)
     best, dead = np.unravel_index(np.argmin(cost), cost.shape)
-    without = _without_filter(channels, cost[0])
-    channel_ratios = without / grid[:, best, dead]
+    unexplained = grid[:, best, dead]
+    channel_ratios = _without_filter(channels, cost[0]) / unexplained
     ratio = float(np.exp(np.log(channel_ratios).mean()))
-    if ratio < IDENTIFICATION.filter_ratio_min or channel_ratios.min() < IDENTIFICATION.filter_channel_ratio_min:
+    is_significant = ratio > IDENTIFICATION.filter_ratio_min
+    acts_on_all = channel_ratios.min() > IDENTIFICATION.filter_channel_ratio_min
+    if not (is_significant and acts_on_all and unexplained.max() < IDENTIFICATION.filter_unexplained_max):
         return None
     return VelocityFilter(parabola_minimum(TIME_CONSTANTS_S, cost[:, dead]), ratio)
 

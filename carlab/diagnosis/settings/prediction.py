@@ -87,6 +87,9 @@ class IdentificationSettings:
     Without a filter it is 1.00 in recordings of the ETH and the DART car and in simulated ones."""
     filter_channel_ratio_min: float = 1.05
     """The same for each channel, because a filter of the velocities acts on all of them."""
+    filter_unexplained_max: float = 0.1
+    """Maximum share of the variance of a velocity that the filter leaves; above it, the velocity is not that of the
+    poses."""
     filter_change_min_s: float = 0.005
     """[s] Minimum difference of a measured time constant from that of the car file, or from 0."""
     filter_smoothing_s: float = 0.08
