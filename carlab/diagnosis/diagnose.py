@@ -131,7 +131,8 @@ def diagnose(
     with FunctionWorkers() if workers is None else nullcontext(workers) as shared:
         control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, shared)
         recordings, faults = _prepare_recordings(fit, held_out, request, progress)
-        measured = measured_filter(recordings.fit_segments, nominal)
+        candidates = tuple(CATALOGUE) if effects is None else tuple(effects)
+        measured = measured_filter(recordings.fit_segments, nominal) if FILTER in candidates else None
         recordings, noise = _estimate_noise(recordings, with_filter(nominal, measured))
         accepted, scored, naming = _search_effects(recordings, noise, measured, request, control, timer)
         withdrawn = withdrawn_effects(decisions, accepted, scored.found.effects)
@@ -206,20 +207,16 @@ def _search_effects(
 ) -> tuple[tuple[str, ...], ScoredSearch, NamingResult]:
     """Search for effects, withdraw spurious ones, and score the result on held-out windows.
 
-    A ``measured`` filter of the velocities is in the simulator of the search and is named afterwards, if it is a
-    candidate. Also returns the effects that the search accepted.
+    The simulator of the search has the ``measured`` filter of the velocities. The filter is no candidate of the search;
+    it is added to the result. Also returns the effects that the search accepted.
     """
     control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, with_filter(request.nominal, measured)
     floor = mean_noise_floor(windows, noise, nominal)
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
-    is_named = measured is not None and FILTER in candidates
-    if is_named:
+    if measured is not None:
         candidates = tuple(name for name in candidates if name != FILTER)
-    searched = nominal if is_named else request.nominal
-    problem = SearchProblem(
-        searched, windows, floor, noise.measured, confusable_effects(), candidates, request.settings
-    )
+    problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
     search_control = control.part(*SEARCH_PROGRESS)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
@@ -237,7 +234,7 @@ def _search_effects(
         scored = without_uncertain_effects(scored, search_control)
         if scored.found.effects != naming.found.effects:
             naming = with_fewer_effects(problem, naming, scored.found, search_control)
-    if measured is not None and is_named:
+    if measured is not None:
         problem, naming = name_filter(problem, request.nominal, replace(naming, found=scored.found), measured)
         scored = ScoredSearch.of(problem, naming.found, held_out)
     timer.end_checks()

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from carlab.diagnosis.identification.velocity_filter import VelocityFilter, velocity_filter
+from carlab.diagnosis.identification.velocity_filter import VELOCITIES, VelocityFilter, velocity_filter
 from carlab.diagnosis.naming import NamingResult
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.refit import fit_base
@@ -26,26 +26,29 @@ TIME_CONSTANT = f"effects.{FILTER}.{VelocityFilterLag.lag_parameter}"
 
 def measured_filter(segments: Sequence[RecordingSegment], nominal: SimulatorConfig) -> VelocityFilter | None:
     """The filter of the velocities; None without one, or if the car file states it."""
-    found = velocity_filter(segments)
-    if found is None:
+    measured = velocity_filter(segments)
+    if measured is None:
         return None
     stated_s = nominal.effects.get(FILTER, {}).get(VelocityFilterLag.lag_parameter, 0.0)
-    difference_s = abs(found.time_constant_s - stated_s)
-    return None if difference_s < IDENTIFICATION.filter_change_min_s else found
+    difference_s = abs(measured.time_constant_s - stated_s)
+    return None if difference_s < IDENTIFICATION.filter_change_min_s else measured
 
 
-def with_filter(nominal: SimulatorConfig, found: VelocityFilter | None) -> SimulatorConfig:
-    """The simulator with the measured filter."""
-    if found is None:
+def with_filter(nominal: SimulatorConfig, measured: VelocityFilter | None) -> SimulatorConfig:
+    """The simulator with the measured filter, if there is one."""
+    if measured is None:
         return nominal
-    value = {VelocityFilterLag.lag_parameter: found.time_constant_s}
-    return replace(nominal, effects={**nominal.effects, FILTER: value})
+    values = {VelocityFilterLag.lag_parameter: measured.time_constant_s}
+    return replace(nominal, effects={**nominal.effects, FILTER: values})
 
 
 def name_filter(
     problem: SearchProblem, nominal: SimulatorConfig, naming: NamingResult, measured: VelocityFilter
 ) -> tuple[SearchProblem, NamingResult]:
     """Add the filter to the accepted effects, and fit its time constant together with their parameters.
+
+    Each channel of a window counts as one observation in the likelihood ratio of the filter (``chi2``), because
+    smoothed rows are dependent.
 
     Args:
         problem: the search, whose simulator has the filter.
@@ -64,7 +67,7 @@ def name_filter(
         each.coordinate(measured.time_constant_s) if each.name == TIME_CONSTANT else known[each.name] for each in free
     ]
     fit = named.fitter(found.scale).fit(named.config_with(effects), free, np.array(start))
-    chi2 = 3.0 * len(problem.windows) * float(np.log(measured.unexplained_ratio))
+    chi2 = len(VELOCITIES) * len(problem.windows) * float(np.log(measured.unexplained_ratio))
     found = replace(
         found,
         base=fit_base(named).fit,
