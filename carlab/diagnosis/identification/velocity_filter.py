@@ -8,6 +8,7 @@ has noise, and any filter would lower its error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,15 +18,18 @@ from scipy.optimize import minimize_scalar
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.settings import IDENTIFICATION
-from carlab.prediction.windows import RecordingSegment
-from carlab.recording.faults.robust import first_order_lag, parabola_minimum, trimmed_scale
+from carlab.prediction.windows import MIN_HISTORY_S, IndexArray, RecordingSegment, history_rows
+from carlab.recording.faults.robust import MAX_FIT_ROWS, first_order_lag, parabola_minimum, trimmed_scale
 from carlab.recording.faults.settings import LIMITS
-from carlab.recording.pose_velocity import BoolArray
 
 VELOCITIES = range(3, 6)
 """Columns of the state: vx, vy, yaw rate."""
-DEAD_TIME_ROWS = np.arange(-1.0, 4.01, 0.25)
-"""Dead times of velocity columns behind the poses, in rows."""
+DEAD_TIME_STEP = 0.25
+"""Step of the grids of dead times, in rows."""
+DEAD_TIME_ROWS = np.arange(-1.0, 4.01, DEAD_TIME_STEP)
+"""Dead times of filtered velocity columns behind the poses, in rows."""
+MAX_DEAD_TIME_S = 0.6
+"""Maximum dead time [s] without a filter: about that of the slowest filter together with its longest dead time."""
 TIME_CONSTANTS_S = np.arange(0.0, 0.4, 0.01)
 """[s] Grid of time constants. Slower filters leave little of a velocity."""
 MIN_SHARE = 1e-12
@@ -47,29 +51,72 @@ class VelocityFilter:
 
 
 @dataclass(frozen=True, slots=True)
-class _Velocity:
-    """A velocity of a segment: the recorded one (n,), that of the pose (n,), both smoothed, and moving rows (n,)."""
+class _Rows:
+    """Compared rows of the segments: index (m,) of each among all n rows, and of both ends of its segment (m,).
 
+    The car moves in these rows. The unknown state of the filter at the start of the segment has decayed there.
+    """
+
+    index: IndexArray
+    first: IndexArray
+    last: IndexArray
+
+    @classmethod
+    def of(cls, segments: Sequence[RecordingSegment]) -> _Rows:
+        speed = np.concatenate([np.hypot(each.smooth[:, 3], each.smooth[:, 4]) for each in segments])
+        counts = np.array([len(each.t_s) for each in segments])
+        last = np.repeat(np.cumsum(counts) - 1, counts)
+        first = last - np.repeat(counts, counts) + 1
+        has_history = np.arange(len(speed)) - first >= history_rows(segments[0].period_s, MIN_HISTORY_S)
+        index = np.flatnonzero((speed > LIMITS.moving_mps) & has_history)
+        index = index[:: max(1, math.ceil(len(index) / MAX_FIT_ROWS))]
+        return cls(index, first[index], last[index])
+
+    def delayed(self, values: FloatArray, dead_rows: float) -> FloatArray:
+        """Values (n,), ``dead_rows`` later, at the compared rows (m,); linear between rows of a segment."""
+        at = np.clip(self.index - dead_rows, self.first, self.last)
+        return np.asarray(np.interp(at, np.arange(len(values)), values))
+
+
+@dataclass(frozen=True, slots=True)
+class _Velocity:
+    """A velocity, smoothed: the recorded one (m,) at the compared rows, and that of the pose (k,) in each segment."""
+
+    rows: _Rows
     recorded: FloatArray
-    of_pose: FloatArray
-    moving: BoolArray
+    of_pose: Sequence[FloatArray]
     period_s: float
 
-    def filtered(self, time_constant_s: float) -> FloatArray:
-        """The velocity of the pose behind a filter (n,)."""
-        return first_order_lag(self.of_pose, self.period_s, time_constant_s)
+    @classmethod
+    def of(cls, segments: Sequence[RecordingSegment], rows: _Rows, column: int) -> _Velocity:
+        period_s = segments[0].period_s
+        width = IDENTIFICATION.filter_smoothing_s / period_s
+        recorded = np.concatenate([gaussian_filter1d(each.states[:, column], width) for each in segments])
+        of_pose = [gaussian_filter1d(each.smooth[:, column], width) for each in segments]
+        return cls(rows, recorded[rows.index], of_pose, period_s)
+
+    def unexplained_shares(self, time_constant_s: float, dead_times: FloatArray) -> FloatArray:
+        """Shares (d,) of its variance that the filtered velocity of the pose leaves, after dead times (d,) [rows]."""
+        filtered = np.concatenate([first_order_lag(each, self.period_s, time_constant_s) for each in self.of_pose])
+        variance = float(np.mean(self.recorded**2)) + MIN_SHARE
+        left = [trimmed_scale(self.rows.delayed(filtered, dead_rows), self.recorded)[1] for dead_rows in dead_times]
+        return np.maximum(np.array(left) / variance, MIN_SHARE)
 
 
 def velocity_filter(segments: Sequence[RecordingSegment]) -> VelocityFilter | None:
-    """The filter of the velocities of recordings; None if a dead time explains them about as well."""
-    channels = [[_velocity(segment, channel) for segment in segments] for channel in VELOCITIES]
-    if any(sum(int(each.moving.sum()) for each in channel) < IDENTIFICATION.filter_min_rows for channel in channels):
+    """The filter of the velocities of recordings; None if a dead time explains them about as well.
+
+    All segments have the same period.
+    """
+    rows = _Rows.of(segments)
+    if len(rows.index) < IDENTIFICATION.filter_min_rows:
         return None
-    grid = np.array([[_unexplained_shares(channel, tau) for tau in TIME_CONSTANTS_S] for channel in channels])
-    cost = np.log(grid).mean(axis=0)  # (time constants, dead times)
+    velocities = [_Velocity.of(segments, rows, column) for column in VELOCITIES]
+    shares = np.array([[v.unexplained_shares(tau, DEAD_TIME_ROWS) for tau in TIME_CONSTANTS_S] for v in velocities])
+    cost = np.log(shares).mean(axis=0)  # (time constants, dead times)
     best, dead = np.unravel_index(np.argmin(cost), cost.shape)
-    unexplained = grid[:, best, dead]
-    channel_ratios = _without_filter(channels, cost[0]) / unexplained
+    unexplained = shares[:, best, dead]
+    channel_ratios = _without_filter(velocities) / unexplained
     ratio = float(np.exp(np.log(channel_ratios).mean()))
     is_significant = ratio > IDENTIFICATION.filter_ratio_min
     acts_on_all = channel_ratios.min() > IDENTIFICATION.filter_channel_ratio_min
@@ -78,41 +125,17 @@ def velocity_filter(segments: Sequence[RecordingSegment]) -> VelocityFilter | No
     return VelocityFilter(parabola_minimum(TIME_CONSTANTS_S, cost[:, dead]), ratio)
 
 
-def _velocity(segment: RecordingSegment, channel: int) -> _Velocity:
-    width = IDENTIFICATION.filter_smoothing_s / segment.period_s
-    recorded, of_pose = (gaussian_filter1d(each[:, channel], width) for each in (segment.states, segment.smooth))
-    moving = np.hypot(segment.smooth[:, 3], segment.smooth[:, 4]) > LIMITS.moving_mps
-    return _Velocity(recorded, of_pose, moving, segment.period_s)
+def _without_filter(velocities: Sequence[_Velocity]) -> FloatArray:
+    """Unexplained shares (channels,) with the best dead time alone, refined between the steps of the grid."""
 
+    def shares(dead_times: FloatArray) -> FloatArray:
+        return np.array([each.unexplained_shares(0.0, dead_times) for each in velocities])
 
-def _unexplained_shares(channel: Sequence[_Velocity], time_constant_s: float) -> FloatArray:
-    """Shares (dead times,) of a velocity that the filtered velocity of the pose leaves."""
-    filtered = [each.filtered(time_constant_s) for each in channel]
-    return np.array([_unexplained_share(channel, filtered, rows) for rows in DEAD_TIME_ROWS])
-
-
-def _unexplained_share(channel: Sequence[_Velocity], filtered: Sequence[FloatArray], dead_rows: float) -> float:
-    recorded = np.concatenate([each.recorded[each.moving] for each in channel])
-    delayed = [_delayed(f, dead_rows)[each.moving] for f, each in zip(filtered, channel, strict=True)]
-    left = trimmed_scale(np.concatenate(delayed), recorded)[1]
-    return max(left / (float(np.mean(recorded**2)) + MIN_SHARE), MIN_SHARE)
-
-
-def _without_filter(channels: Sequence[Sequence[_Velocity]], cost: FloatArray) -> FloatArray:
-    """Shares (channels,) that the best dead time leaves, refined between the rows of the grid with ``cost``."""
-    nearest = DEAD_TIME_ROWS[np.argmin(cost)]
-    step = DEAD_TIME_ROWS[1] - DEAD_TIME_ROWS[0]
-
-    def shares(dead_rows: float) -> FloatArray:
-        return np.array([_unexplained_share(c, [each.of_pose for each in c], dead_rows) for c in channels])
-
+    dead_times = np.arange(DEAD_TIME_ROWS[0], MAX_DEAD_TIME_S / velocities[0].period_s, DEAD_TIME_STEP)
+    nearest = dead_times[np.argmin(np.log(shares(dead_times)).mean(axis=0))]
     refined = minimize_scalar(
-        lambda rows: np.log(shares(rows)).mean(), bounds=(nearest - step, nearest + step), method="bounded"
+        lambda rows: float(np.log(shares(np.array([rows]))).mean()),
+        bounds=(nearest - DEAD_TIME_STEP, nearest + DEAD_TIME_STEP),
+        method="bounded",
     )
-    return shares(float(refined.x))
-
-
-def _delayed(values: FloatArray, rows: float) -> FloatArray:
-    """Values (n,) ``rows`` rows later, linear between rows."""
-    index = np.arange(len(values), dtype=np.float64)
-    return np.interp(index - rows, index, values)
+    return shares(np.array([refined.x]))[:, 0]

@@ -84,7 +84,7 @@ class IdentificationSettings:
     """Minimum variance of the velocity window [standard errors]."""
     filter_ratio_min: float = 1.2
     """Minimum ratio of the unexplained variances of the velocities without and with a filter, both with a dead time.
-    Without a filter it is 1.00 in recordings of the ETH and the DART car and in simulated ones."""
+    Without a filter it is at most 1.09 in recordings of the ETH and the DART car (docs/decisions/0052)."""
     filter_channel_ratio_min: float = 1.05
     """The same for each channel, because a filter of the velocities acts on all of them."""
     filter_unexplained_max: float = 0.1
@@ -95,7 +95,7 @@ class IdentificationSettings:
     filter_smoothing_s: float = 0.08
     """[s] Standard deviation of the Gaussian that smooths velocities before the comparison: motion below 2 Hz."""
     filter_min_rows: int = 200
-    """Minimum number of moving rows for this comparison."""
+    """Minimum number of rows for this comparison; the car moves, and the segment has a history before them."""
     curve_std: float = 10.0
     """Prior standard deviation of a measured curve's deviations, in typical sizes: keeps knots without data at 0."""
     curve_roughness_std: float = 1.0
