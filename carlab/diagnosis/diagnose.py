@@ -124,16 +124,13 @@ def diagnose(
     """
     share = checked_held_out_share(holdout_share, settings.windows)
     timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)
-    nominal = with_known_latency(nominal, (*fit, *held_out))
-    stages = curves, ceiling, discrepancy, adapt, keep_events
-    request = Request(nominal, uses, data_faults, effects, share, seed, settings, *stages)
+    known, stages = with_known_latency(nominal, (*fit, *held_out)), (curves, ceiling, discrepancy, adapt, keep_events)
+    request = Request(known, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     with FunctionWorkers() if workers is None else nullcontext(workers) as shared:
         control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, shared)
         recordings, faults = _prepare_recordings(fit, held_out, request, progress)
-        candidates = tuple(CATALOGUE) if effects is None else tuple(effects)
-        measured = measured_filter(recordings.fit_segments, nominal) if FILTER in candidates else None
-        recordings, noise = _estimate_noise(recordings, with_filter(nominal, measured))
+        recordings, noise, measured = _measure(recordings, request)
         accepted, scored, naming = _search_effects(recordings, noise, measured, request, control, timer)
         withdrawn = withdrawn_effects(decisions, accepted, scored.found.effects)
         outcome = _assemble_result(scored, naming, withdrawn, recordings, replace(request, data_faults=faults), control)
@@ -186,15 +183,23 @@ def _prepare_recordings(
     return recordings, faults
 
 
-def _estimate_noise(recordings: SplitRecordings, nominal: SimulatorConfig) -> tuple[SplitRecordings, Noise]:
-    """Correct the initial states of the windows, and estimate the noise of the recordings."""
+def _candidates(request: Request) -> tuple[str, ...]:
+    """Effects that may be accepted."""
+    return tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
+
+
+def _measure(recordings: SplitRecordings, request: Request) -> tuple[SplitRecordings, Noise, VelocityFilter | None]:
+    """Measure the filter of the velocities, correct the initial states of the windows, and estimate the noise."""
+    is_candidate = FILTER in _candidates(request)
+    measured = measured_filter(recordings.fit_segments, request.nominal) if is_candidate else None
     fit_windows, held_out_windows, event_windows = with_initial_states(
-        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows), nominal
+        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows),
+        with_filter(request.nominal, measured),
     )
     recordings = replace(
         recordings, fit_windows=fit_windows, held_out_windows=held_out_windows, event_windows=event_windows
     )
-    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias)
+    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias), measured
 
 
 def _search_effects(
@@ -213,9 +218,7 @@ def _search_effects(
     control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, with_filter(request.nominal, measured)
     floor = mean_noise_floor(windows, noise, nominal)
-    candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
-    if measured is not None:
-        candidates = tuple(name for name in candidates if name != FILTER)
+    candidates = tuple(name for name in _candidates(request) if measured is None or name != FILTER)
     problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
     search_control = control.part(*SEARCH_PROGRESS)
     found = search(problem, search_control)
