@@ -287,26 +287,26 @@ def missing_columns(mapping: ColumnMapping, header: Sequence[str]) -> list[str]:
 
 def conversions(mapping: ColumnMapping) -> str:
     """The conversions that a mapping declares, as a list in words."""
-    conversions = []
+    texts = []
     for channel, source in mapping.columns.items():
         factor = source.factor(channel)
         if factor != 1.0 or source.neutral or source.name != channel:
             column = f"'{source.name}'" if not source.neutral else f"('{source.name}' - {source.neutral:g})"
-            conversions.append(f"{channel} from {column}" + ("" if factor == 1.0 else f" times {factor:.6g}"))
+            texts.append(f"{channel} from {column}" + ("" if factor == 1.0 else f" times {factor:.6g}"))
     if mapping.velocity_frame == "world":
-        conversions.append("velocities rotated from the world into the body frame")
+        texts.append("velocities rotated from the world into the body frame")
     if mapping.swap_xy:
-        conversions.append("x and y swapped")
+        texts.append("x and y swapped")
     if mapping.yaw_offset_rad:
-        conversions.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
+        texts.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
     if mapping.repair_yaw_rate:
-        conversions.append("wrap spikes of yaw_rate repaired from the pose")
+        texts.append("wrap spikes of yaw_rate repaired from the pose")
     if mapping.throttle_gate:
-        conversions.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
+        texts.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
     if mapping.command_lag_s:
-        conversions.append(f"commands shifted {mapping.command_lag_s * 1e3:.0f} ms earlier")
+        texts.append(f"commands shifted {mapping.command_lag_s * 1e3:.0f} ms earlier")
     if mapping.clock == "even":
-        conversions.append("stamps of an even clock in place of the recorded ones")
+        texts.append("stamps of an even clock in place of the recorded ones")
     if mapping.dead_reckoning:
-        conversions.append("pose integrated from speed and turn rate")
-    return ", ".join(conversions) if conversions else "nothing needed conversion"
+        texts.append("pose integrated from speed and turn rate")
+    return ", ".join(texts) if texts else "nothing needed conversion"

@@ -15,8 +15,8 @@ CANONICAL = ColumnMapping({name: ColumnSource(name) for name in CHANNELS}, layou
 # lasgroup/simulation_transfer, recordings_rc_car_v0. Declared, each checked on both files:
 # - vx_world, vy_world are in the world frame: median difference to the differentiated pose 0.004 m/s there, against
 #   0.5 to 1 m/s if read as body velocities.
-# - all velocities are backward differences of the pose (they match those half a period better than any other shift),
-#   so they are half of the nominal 1/30 s late.
+# - all velocities are backward differences of the pose: their difference to its derivative is smallest with a shift of
+#   half a period, so they are half of the nominal 1/30 s late.
 # - yaw_rate: a negative spike of 85 to 245 rad/s in each of the 14 + 9 rows where yaw passes 0 counter-clockwise, none
 #   clockwise: a difference of an angle in [0, 2 pi) whose wrap was handled on one side only. The pose there is clean.
 # - steering is positive to the left and throttle positive forward already: nothing to flip.
@@ -42,7 +42,7 @@ ETH = ColumnMapping(
 # - the car multiplies the throttle by the dead-man's safety value (their ROS_packages/racecar_pkg/src/
 #   racecar_universal.py: car.throttle = throttle * safety_value); the steering acts regardless. In 70_racetrack_lap
 #   the logged throttle is 0.25 for 676 rows in which the car stands still and safety_value is 0.
-# - "vel encoder" and "W (IMU)" measure vx and yaw rate again, through filters: kept for comparison only.
+# - "vel encoder" and "W (IMU)" are filtered measurements of vx and yaw rate: used for comparison only.
 _DART_COMMANDS = {"steering": ColumnSource("steering"), "throttle": ColumnSource("throttle")}
 DART = ColumnMapping(
     {
@@ -71,7 +71,7 @@ DART_ONBOARD = ColumnMapping(
 )
 _QUATERNION = re.compile(r"(orientation|rotation|quat)\w*[._ ]?w$|^q[._]?w$", re.IGNORECASE)
 """Name of a column with the scalar part of an orientation, as motion capture and ROS export it."""
-_ORDER = (ETH, CANONICAL, DART, DART_ONBOARD)  # an export of DART data is canonical and keeps its sensors beside
+_ORDER = (ETH, CANONICAL, DART, DART_ONBOARD)  # an export of DART data has the canonical layout and further columns
 
 
 def _n_present(mapping: ColumnMapping, header: Sequence[str]) -> int:

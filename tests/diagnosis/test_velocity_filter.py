@@ -142,7 +142,7 @@ def test_filter_is_named_although_the_simulator_is_wrong():
         episode(filtered_velocities(0.1)), carlab.load_car("rc_car"), effects=[FILTER, "command_delay"], budget_s=30.0
     )
     assert next(iter(report.effects)) == FILTER
-    assert FILTER not in {decision.effect for decision in report.figure_data.decisions}  # the search has no say
+    assert FILTER not in {decision.effect for decision in report.figure_data.decisions}  # no decision of the search
     estimate = report.effects[FILTER].parameters["time_constant"]
     assert estimate.low90 < 0.1 < estimate.high90
     assert report.diagnosis.held_out["with_effects"].score > 3.0

@@ -1,4 +1,4 @@
-"""Messages of a ROS bag in unusual forms: their times, their fields, and messages that are left out."""
+"""Messages of a ROS bag in unusual forms: their times, their fields, and omitted messages."""
 
 import math
 
