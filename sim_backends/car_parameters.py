@@ -12,7 +12,7 @@ from typing import Any, Self
 from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys, number
 from sim_backends.array_ops import FLOATS
-from sim_backends.effects import EFFECTS, MeasuredCurve, delays_s
+from sim_backends.effects import EFFECTS, MeasuredCurve, axle_distances_m, delays_s
 from sim_backends.effects.base import MODEL_KINDS, ModelKind
 from sim_backends.measurement import LATENCY, MeasurementModel
 from sim_backends.registry import REGISTRY, ParameterInfo, section
@@ -155,6 +155,11 @@ class SimulatorConfig:
     def latency_s(self) -> float:
         """Latency of motion capture with all effects [s]."""
         return float(MeasurementModel(FLOATS, self.values(), self.effects).latency_s)
+
+    def axle_distances_m(self) -> tuple[float, float]:
+        """Distances of the front and of the rear axle from the centre of mass with all effects [m]."""
+        front_m, rear_m = axle_distances_m(FLOATS, self.values(), self.effects)
+        return float(front_m), float(rear_m)
 
     @classmethod
     def from_tables(cls, tables: Mapping[str, Any], where: str = "the car file") -> Self:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.dynamics.effect_hooks import EffectHooks
+from sim_backends.effects import axle_distances_m
 from sim_backends.effects.base import GRAVITY_MPS2, SLIP_FLOOR_MPS, Forces, ModelKind, StiffStep
 
 RELAXATION_S = 0.05
@@ -67,7 +68,7 @@ class SingleTrack:
         self.kind: ModelKind = kind
         self.mass = values["vehicle.mass"]
         self.inertia = values["vehicle.yaw_inertia"]
-        self.front_axle, self.rear_axle = values["vehicle.front_axle"], values["vehicle.rear_axle"]
+        self.front_axle, self.rear_axle = axle_distances_m(ops, values, effects)
         self.drive_gain, self.damping = values["motor.drive_gain"], values["motor.damping"]
         self.front_b, self.front_c = tyre["front.B"], tyre["front.C"]
         self.rear_b, self.rear_c = tyre["rear.B"], tyre["rear.C"]

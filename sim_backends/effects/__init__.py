@@ -4,7 +4,7 @@ To add your own effect, write its class and call ``sim_backends.registry.registe
 list it here.
 
 Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity, offset) and
-throttle (dead band, nonlinearity, asymmetry, lag) -> front slip angle (play) -> loads (downforce) -> friction (drift,
+throttle (dead band, nonlinearity, asymmetry, lag) -> axle distances (wheelbase, centre of mass) -> front slip angle (play) -> loads (downforce) -> friction (drift,
 patch) -> drive (sag, brake asymmetry, drag brake, saturation) -> driven axle (combined slip, speed controller,
 traction limit, wheel slip) -> body (resistances, slope, bias, moments) -> load transfer -> side forces (ellipse, roll,
 relaxation) -> motion -> what is measured (marker offset, yaw misalignment, velocity filter, latency). Within a group:
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from sim_backends.array_ops import Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import (
     ActuatorEffect,
     Confusable,
@@ -40,6 +40,7 @@ from sim_backends.effects.drive import (
     SpeedController,
     TractionLimit,
 )
+from sim_backends.effects.geometry import CentreOfMass, Wheelbase
 from sim_backends.effects.lags import MotorLag, SteeringLag
 from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
 from sim_backends.effects.observations import MarkerOffset, MocapLatency, MocapYawMisalignment, VelocityFilterLag
@@ -89,6 +90,8 @@ _ALL: tuple[Effect, ...] = (
     RollingResistance(),
     AerodynamicDrag(),
     CorneringDrag(),
+    Wheelbase(),
+    CentreOfMass(),
     TyreSaturation(),
     FrontWheelPlay(),
     FrictionEllipse(),
@@ -123,6 +126,21 @@ def separation(one: str, other: str) -> Confusable | None:
             if entry.effect == confused:
                 return entry
     return None
+
+
+def axle_distances_m(ops: Ops, values: Mapping[str, Value], effects: Iterable[str]) -> tuple[Value, Value]:
+    """Distances of the front and of the rear axle from the centre of mass [m], each () or (cars,).
+
+    Args:
+        ops: functions of the array library of ``values``.
+        values: numbers by dotted name.
+        effects: ids of effects; those of class DynamicsEffect are used.
+    """
+    front_m, rear_m = values["vehicle.front_axle"], values["vehicle.rear_axle"]
+    dynamics = (e for e in (EFFECTS[name] for name in effects) if isinstance(e, DynamicsEffect))
+    for effect in sorted(dynamics, key=lambda e: (e.order, e.id)):
+        front_m, rear_m = effect.axle_distances_m(ops, front_m, rear_m, effect.numbers(values))
+    return front_m, rear_m
 
 
 def delays_s(base_s: Value, values: Mapping[str, Value], effects: Iterable[str]) -> tuple[Value, Value]:

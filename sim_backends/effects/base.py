@@ -312,6 +312,10 @@ class DynamicsEffect(Effect):
         """Change the form of the base model and its tyre parameters (``front.mu`` [1], ``rear.B`` [1/rad] ...)."""
         return kind, tyre
 
+    def axle_distances_m(self, ops: Ops, front_m: Value, rear_m: Value, values: Parameters) -> tuple[Value, Value]:
+        """Change the distances of the front and of the rear axle from the centre of mass [m]."""
+        return front_m, rear_m
+
     def required_method(self) -> str:
         """See ``Effect``."""
         return "stiff_step" if self.stiff else ""

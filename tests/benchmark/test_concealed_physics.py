@@ -25,7 +25,13 @@ NOISE_FLOOR = np.array([6e-4, 6e-4, 2e-3, 0.01, 0.01, 0.03])
 FORMS = all_forms()
 CAR = BaseCar()
 # Sizes whose influence is many noise floors within a second.
-STRONG = {"battery_sag": 0.3, "friction_drift": 0.4, "longitudinal_slip": 2.0, "tyre_saturation": 0.8}
+STRONG = {
+    "battery_sag": 0.3,
+    "friction_drift": 0.4,
+    "longitudinal_slip": 2.0,
+    "tyre_saturation": 0.8,
+    "wheelbase": 0.1,
+}
 
 
 def commands(seed: int = 1, count: int = 31, period_s: float = CAR.control_period) -> np.ndarray:

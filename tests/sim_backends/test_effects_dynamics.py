@@ -43,6 +43,7 @@ CASES = {
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
     "all_wheel_drive_with_ellipse": {"all_wheel_drive": {"share": 0.6}, "friction_ellipse": {"scale": 0.7}},
     "all_wheel_drive_with_transfer": {"all_wheel_drive": {"share": 0.5}, "load_transfer": {"height": 0.06}},
+    "longer_car": {"wheelbase": {"change": 0.2}, "centre_of_mass": {"ahead": -0.03}, "load_transfer": {"height": 0.06}},
     "play": {"front_wheel_play": {"angle": 0.06}},
     "play_with_transfer": {"front_wheel_play": {"angle": 0.04}, "load_transfer": {"height": 0.06}},
     "spinning_wheels": {"combined_slip": {"grip_ratio": 0.5}},
@@ -153,6 +154,10 @@ def reference_rates(t, s, d, u, p, e):
     x, y, yaw, vx, vy, r, lag_front, lag_rear, rim, roll, roll_rate = s
     m, a, b = p.mass_kg, p.front_axle_m, p.rear_axle_m
     has = e.__contains__
+    if has("wheelbase"):
+        a, b = (1 + e["wheelbase"]["change"]) * a, (1 + e["wheelbase"]["change"]) * b
+    if has("centre_of_mass"):
+        a, b = a - e["centre_of_mass"]["ahead"], b + e["centre_of_mass"]["ahead"]
     z_front, z_rear = m * G * b / (a + b), m * G * a / (a + b)
     if has("aerodynamic_downforce"):
         extra = e["aerodynamic_downforce"]["coefficient"] * vx**2

@@ -43,6 +43,8 @@ IDS = [
     "rolling_resistance",
     "aerodynamic_drag",
     "cornering_drag",
+    "wheelbase",
+    "centre_of_mass",
     "tyre_saturation",
     "front_wheel_play",
     "friction_ellipse",

@@ -56,6 +56,8 @@ def library(data: Prepared) -> dict[str, Term]:
         "tyre_relaxation": _relaxation,
         "battery_sag": _command_term_of_time(lambda t: 1.0 - 0.002 * t),
         "friction_drift": _grip(lambda s: (1.0 + 0.002 * s.t_s, 1.0 + 0.002 * s.t_s)),
+        "wheelbase": _axles(lambda car: (0.02 * car.front_axle, 0.02 * car.rear_axle)),
+        "centre_of_mass": _axles(lambda car: (-0.02 * car.wheelbase, 0.02 * car.wheelbase)),
         "front_wheel_play": _grip(lambda s: (_slip_beyond_play(s, 0.02), 1.0)),
         "friction_ellipse": _grip(lambda s: (1.0, _combined(s, 0.3))),
         "combined_slip": _spinning,
@@ -120,6 +122,17 @@ def _grip(factors: Callable[[Steps], tuple[object, object]]) -> Term:
     def term(s: Steps) -> FloatArray:
         front, rear = (np.broadcast_to(np.asarray(f), len(s.starts)) for f in factors(s))
         return _gained(s, s.rolled(scaled={"tyre.front.mu": front, "tyre.rear.mu": rear}))
+
+    return term
+
+
+def _axles(moves_m: Callable[[BaseCar], tuple[float, float]]) -> Term:
+    """Front and rear axle further from the centre of mass by some distances [m]."""
+
+    def term(s: Steps) -> FloatArray:
+        front_m, rear_m = moves_m(s.car)
+        car = dataclasses.replace(s.car, front_axle=s.car.front_axle + front_m, rear_axle=s.car.rear_axle + rear_m)
+        return _gained(s, dataclasses.replace(s, car=car).rolled())
 
     return term
 

@@ -40,6 +40,8 @@ CONFUSABLE: dict[str, tuple[str, ...]] = {
     "rolling_resistance": ("throttle_deadband",),
     "aerodynamic_drag": ("motor_saturation",),
     "cornering_drag": (),
+    "wheelbase": (),
+    "centre_of_mass": ("marker_offset",),
     "tyre_saturation": ("steering_nonlinearity",),
     "front_wheel_play": ("steering_deadband", "steering_backlash"),
     "friction_ellipse": ("load_transfer",),
@@ -56,7 +58,7 @@ CONFUSABLE: dict[str, tuple[str, ...]] = {
     "lateral_bias": ("steering_offset",),
     "road_slope": ("lateral_bias",),
     "mocap_latency": ("command_delay",),
-    "marker_offset": (),
+    "marker_offset": ("centre_of_mass",),
     "mocap_yaw_misalignment": ("steering_offset",),
     "velocity_filter_lag": ("motor_lag", "steering_lag"),
     "speed_controller": ("motor_saturation", "traction_limit"),
@@ -108,7 +110,8 @@ class Form:
     """One form of one effect.
 
     ``sized`` turns a size (0: identity, growing with the effect) into parameters; in the catalogue form these are the
-    catalogue's. ``attach`` puts the effect into a world. ``typical`` and ``largest`` are sizes: where the search for a
+    catalogue's. ``attach`` puts the effect into a world; a form that ``changes_car`` is attached before the others,
+    because they read its dimensions. ``typical`` and ``largest`` are sizes: where the search for a
     strength begins, and beyond which nothing is sensible; below ``smallest`` the equations are too stiff to integrate.
     """
 
@@ -122,6 +125,7 @@ class Form:
     nominal_kind: Literal["dynamic", "linear_tyre"] = "dynamic"
     class_words: tuple[tuple[str, ...], ...] = ()
     smallest: float = 0.0
+    changes_car: bool = False
 
 
 def hook(stage: str, *, first: bool = False) -> Callable[[Callable[[Instant, Parameters, BaseCar], None]], Attach]:

@@ -78,9 +78,9 @@ def quantised(world: World, p: Parameters) -> None:
         world.steering_maps.append(lambda d: step * math.floor(d / step + 0.5))
 
 
-def scale_error(world: World, p: Parameters) -> None:
-    """Motion capture with a scale error."""
-    scale = np.array([1.0 + p["scale"], 1.0 + p["scale"], 1.0])
+def stretched_motion_capture(world: World, p: Parameters) -> None:
+    """Motion capture with a scale error along one axis of the world."""
+    scale = np.array([1.0 + p["scale"], 1.0, 1.0])
 
     def stretch(t: FloatArray, pose: FloatArray) -> FloatArray:
         return np.asarray(pose * scale, dtype=np.float64)
@@ -159,8 +159,8 @@ FORMS = (
     Form("wheel_imbalance", OUTSIDE, plain("force"), imbalance, 0.2, 6.0,
          class_words=(("period", "frequen", "oscillat", "vibrat", "speed"),)),
     Form("command_quantisation", OUTSIDE, plain("step"), quantised, 0.03, 0.5, class_words=(("steering",),)),
-    Form("mocap_scale", OUTSIDE, signed("scale"), scale_error, 0.003, 0.2,
-         class_words=(("speed", "proportion", "scale", "gain"),)),
+    Form("mocap_stretch", OUTSIDE, signed("scale"), stretched_motion_capture, 0.005, 0.2,
+         class_words=(("heading", "direction", "world", "place", "position", "location"),)),
     Form("cable_pull", OUTSIDE, cable_parameters, cable, 0.02, 1.0, class_words=(("place", "position", "location"),)),
     Form("motor_hysteresis", OUTSIDE, plain("width"), motor_hysteresis, 0.03, 0.6,
          class_words=(("throttle", "history", "hysteresis", "state"),)),

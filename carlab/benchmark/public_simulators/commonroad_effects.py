@@ -58,6 +58,8 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "rolling_resistance": (_NO_DRAG,),
     "aerodynamic_drag": (_NO_DRAG,),
     "cornering_drag": (Physics("similar", "slip (r_bx1, combined slip), camber and load transfer lower F_x"),),
+    "wheelbase": (Physics("no", "the car file has the wheelbase of the simulator"),),
+    "centre_of_mass": (Physics("no", "the car file has the axle distances of the simulator"),),
     "tyre_saturation": (Physics("yes", "Magic Formula; the nominal car file has one already"),),
     "front_wheel_play": (Physics("no", "the front tyres' slip follows from the steering angle without play"),),
     "friction_ellipse": (Physics("yes", "combined slip: formula_lateral_comb, formula_longitudinal_comb"),),

@@ -83,6 +83,7 @@ def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Force
     The first command is held before the recording begins, because earlier commands are unknown.
     """
     parameters = config.parameters
+    front_m, rear_m = config.axle_distances_m()
     vx, vy, yaw_rate = segment.smooth[:, 3:].T
     rows = np.arange(len(vx))
     commands = [
@@ -95,7 +96,7 @@ def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Force
     return Forces(
         t_s=segment.t_s, x=zero, y=zero, yaw=zero, vx=vx, vy=vy, yaw_rate=yaw_rate,
         wheel_angle=angle, wheel_sin=np.sin(angle), wheel_cos=np.cos(angle), throttle=commands[1],
-        mass=parameters.mass_kg, front_axle=parameters.front_axle_m, rear_axle=parameters.rear_axle_m,
+        mass=parameters.mass_kg, front_axle=front_m, rear_axle=rear_m,
         load_front=zero, load_rear=zero, grip_front=zero, grip_rear=zero,
         full_drive=np.full_like(vx, parameters.drive_gain_n), damping=zero, rear_stiffness=zero,
         axle_force=parameters.mass_kg * acceleration,

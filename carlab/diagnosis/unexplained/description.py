@@ -151,7 +151,8 @@ def _yaw_per_side_acceleration(config: SimulatorConfig) -> tuple[float, float]:
     """Yaw acceleration [rad/s2] by a side force of the front and of the rear axle that gives 1 m/s2."""
     values = config.values()
     per_inertia = values["vehicle.mass"] / values["vehicle.yaw_inertia"]
-    return per_inertia * values["vehicle.front_axle"], -per_inertia * values["vehicle.rear_axle"]
+    front_m, rear_m = config.axle_distances_m()
+    return per_inertia * front_m, -per_inertia * rear_m
 
 
 def start_features(windows: PredictionWindows) -> dict[str, FloatArray]:
