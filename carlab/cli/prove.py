@@ -54,7 +54,7 @@ class Prove:
     """Folder of the proof; an unfinished proof with the same options is continued."""
 
     set: Literal["short", "full", "development", "hard", "hard-development", "real"] = "short"
-    """short: five small cases. full: 412 cases of the test set. hard: 300 cases with three to five effects, 30 s of
+    """short: five small cases. full: 420 cases of the test set. hard: 308 cases with three to five effects, 30 s of
     recording, a wrong kind of base model, feedback driving only, or jitter in the stamps. development,
     hard-development: as many cases with other seeds, for tuning. real: about 150 cases with effects of commands and
     sensors concealed in recordings of a real car."""

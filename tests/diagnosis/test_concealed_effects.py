@@ -1,4 +1,4 @@
-"""Test that a diagnosis names settings of a motor controller, and play, that an independent generator conceals."""
+"""Test that a diagnosis names settings of a motor controller, play, and axle distances that an independent generator conceals."""
 
 from pathlib import Path
 
@@ -34,11 +34,14 @@ STEERING_EFFECTS = (
     "tyre_relaxation",
     "front_wheel_play",
 )
+AXLE_EFFECTS = ("wheelbase", "centre_of_mass", "marker_offset", "yaw_damping")
 CONCEALED = {
     "speed_controller": {"forward_force": 0.5 * CAR.drive_gain, "backward_force": 0.3 * CAR.drive_gain},
     "drag_brake": {"force": 0.3 * CAR.drive_gain},
     "throttle_asymmetry": {"gain_ratio": 0.6},
     "front_wheel_play": {"angle": 0.03},
+    "wheelbase": {"change": 0.25},
+    "centre_of_mass": {"ahead": 0.06},
 }
 
 
@@ -61,7 +64,8 @@ def recorded(effect: str, seed: int, duration_s: float) -> EpisodeData:
 def test_concealed_effect_is_named_with_its_numbers(effect: str, tmp_path: Path) -> None:
     CAR.write(tmp_path / "car.toml")
     fit, held_out = recorded(effect, 1, 30.0), recorded(effect, 2, 12.0)
-    found = diagnose([fit], [held_out], car_in(tmp_path), effects=MOTOR_EFFECTS + STEERING_EFFECTS).diagnosis
+    candidates = MOTOR_EFFECTS + STEERING_EFFECTS + AXLE_EFFECTS
+    found = diagnose([fit], [held_out], car_in(tmp_path), effects=candidates).diagnosis
     assert [e.id for e in found.effects] == [effect]
     for name, value in CONCEALED[effect].items():
         assert found.effects[0].parameters[name].value == pytest.approx(value, rel=0.1), name

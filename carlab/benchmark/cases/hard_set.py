@@ -20,9 +20,9 @@ CONDITIONS = ("short", "base_model", "feedback", "stamps")
 
 
 def hard_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
-    """Cases of the hard set, 300 in all.
+    """Cases of the hard set, 308 in all.
 
-    * 172 with one effect: every effect once under each of the four CONDITIONS, with every strength once,
+    * 180 with one effect: every effect once under each of the four CONDITIONS, with every strength once,
     * 36 with three, four or five effects,
     * 12 with three effects under all conditions except a wrong base model,
     * 40 without an effect: ten under each condition, half of them with wrong base parameters,
