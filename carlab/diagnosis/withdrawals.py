@@ -13,7 +13,7 @@ REASONS: Mapping[str, str] = {
     "selection.min_held_out_rise": "the error on held-out recordings does not fall",
     "evidence.identity_distance_min": "its parameters do not differ significantly from those without the effect",
     "evidence.range_ratio_min": "the interval of its parameter reaches the end of the range",
-    "rivals.curve_z_min": "the loss on left-out blocks is lower with a measured curve of the command",
+    "rivals.curve_z_min": "the loss on left-out blocks is lower with a measured curve in its place",
     "rivals.min_explained_share": "it explains too small a share of the error",
     "rivals.min_unnamed_share": "physics outside the catalogue explains much of the error",
     "rivals.unnamed_ratio": "physics outside the catalogue explains more of the error in its place",

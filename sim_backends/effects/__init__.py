@@ -3,12 +3,12 @@
 To add your own effect, write its class and call ``sim_backends.registry.register``. To add an effect to the package,
 list it here.
 
-Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity, offset) and
-throttle (dead band, nonlinearity, asymmetry, lag) -> axle distances (wheelbase, centre of mass) -> front slip angle (play) -> loads (downforce) -> friction (drift,
-patch) -> drive (sag, brake asymmetry, drag brake, saturation) -> driven axle (combined slip, speed controller,
-traction limit, wheel slip) -> body (resistances, slope, bias, moments) -> load transfer -> side forces (ellipse, roll,
-relaxation) -> motion -> what is measured (marker offset, yaw misalignment, velocity filter, latency). Within a group:
-by ``order``, then by id.
+Acting order: axle distances (wheelbase, centre of mass; before the first step) -> command -> delays -> steering (dead
+band, rate limit, lag, backlash, asymmetry, nonlinearity, offset) and throttle (dead band, nonlinearity, asymmetry, lag)
+-> front slip angle (play) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake asymmetry, drag brake,
+saturation) -> driven axle (combined slip, speed controller, traction limit, wheel slip) -> body (resistances, slope,
+bias, moments) -> load transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is measured (marker offset,
+yaw misalignment, velocity filter, latency). Within a group: by ``order``, then by id.
 """
 
 from __future__ import annotations

@@ -22,7 +22,9 @@ class Wheelbase(DynamicsEffect):
     base_models = ("dynamic", "linear_tyre", "blend")
     """The kinematic car turns by ``tan(d) / L``: the wheelbase and the largest steering angle do nearly the same."""
     name = "a wheelbase that differs from the car file"
-    summary = "The wheelbase differs from the car file, or motion capture measures all distances too large or too small."
+    summary = (
+        "The wheelbase differs from the car file, or motion capture measures all distances too large or too small."
+    )
     sentence = (
         "the wheelbase is {change:size percent} {change:longer|shorter} than in the car file, or motion capture "
         "measures all distances too {change:large|small} by this share"

@@ -17,7 +17,6 @@ from sim_backends.effects.base import (
     DynamicsEffect,
     EffectParameter,
     Forces,
-    ObservationEffect,
     Parameters,
     ScreeningProbe,
 )
@@ -164,28 +163,4 @@ class CoastBrake(DynamicsEffect):
         forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.exp(-share * share), forces.force_x)
 
 
-class PositionScale(ObservationEffect):
-    """``p_meas = (1 + scale) p``, also for the velocities: a scale error of motion capture."""
-
-    id = "position_scale"
-    catalogued = False
-    order = 50
-    summary = "Motion capture has a scale error."
-    class_statement = "every length and speed is proportionally too long or too short, as by a scale of motion capture"
-    parameters = (EffectParameter("scale", "1", 0.0, -0.5, 0.5, 0.03),)
-    confusable = (Confusable("marker_offset"),)
-
-    def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Multiply positions and velocities by ``1 + scale``."""
-        x, y, yaw, vx, vy, yaw_rate = state
-        stretch = 1.0 + values["scale"]
-        return x * stretch, y * stretch, yaw, vx * stretch, vy * stretch, yaw_rate
-
-    def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Divide positions and velocities by ``1 + scale``."""
-        x, y, yaw, vx, vy, yaw_rate = measured
-        stretch = 1.0 + values["scale"]
-        return x / stretch, y / stretch, yaw, vx / stretch, vy / stretch, yaw_rate
-
-
-UNCATALOGUED = (Wind(), FrontSideForce(), RearSideForce(), LockedAxle(), BrakingPull(), CoastBrake(), PositionScale())
+UNCATALOGUED = (Wind(), FrontSideForce(), RearSideForce(), LockedAxle(), BrakingPull(), CoastBrake())

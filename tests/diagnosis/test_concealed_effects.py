@@ -1,4 +1,4 @@
-"""Test that a diagnosis names settings of a motor controller, play, and axle distances that an independent generator conceals."""
+"""Test that a diagnosis names what an independent generator conceals: motor settings, play, and axle distances."""
 
 from pathlib import Path
 

@@ -20,7 +20,7 @@ from sim_backends.plant import Plant
 QUIET = MocapParameters(latency_s=0.0)
 HISTORY = 8
 TICKS = 90
-OBSERVATIONS = ("marker_offset", "mocap_yaw_misalignment", "position_scale", "velocity_filter_lag", "mocap_latency")
+OBSERVATIONS = ("marker_offset", "mocap_yaw_misalignment", "velocity_filter_lag", "mocap_latency")
 POSE_DEPENDENT = {e.id for e in EFFECTS.values() if e.depends_on & {"place", "heading"}}
 MASS = {"vehicle.mass": (2.0, 2.0)}
 
@@ -103,28 +103,21 @@ def test_pose_dependent_effects_are_ignored():
     assert np.array_equal(predicted(sloping, rows), predicted(replace(sloping, effects={}), rows))
 
 
-def motion_capture_measurement(states, ahead, left, angle, scale):
-    """Apply marker offset, yaw misalignment and position scale to true states by their definitions."""
+def motion_capture_measurement(states, ahead, left, angle):
+    """Apply marker offset and yaw misalignment to true states by their definitions."""
     x, y, yaw, vx, vy, rate = states.T
     along, across = vx - left * rate, vy + ahead * rate
     px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
     py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
-    px, py, along, across = ((1 + scale) * v for v in (px, py, along, across))
     rotated = [np.cos(angle) * along + np.sin(angle) * across, np.cos(angle) * across - np.sin(angle) * along]
     return np.stack([px, py, yaw + angle, *rotated, rate], axis=1)
 
 
 def test_model_inverts_and_reapplies_motion_capture_effects():
-    offset, angle, scale = {"ahead": 0.06, "left": -0.03}, 0.11, 0.04
-    effects = {
-        "position_scale": {"scale": scale},
-        "marker_offset": offset,
-        "mocap_yaw_misalignment": {"angle": angle},
-    }
+    offset, angle = {"ahead": 0.06, "left": -0.03}, 0.11
+    effects = {"marker_offset": offset, "mocap_yaw_misalignment": {"angle": angle}}
     sent, plain = commands(), SimulatorConfig(mocap=QUIET)
-    rows = rows_of(
-        motion_capture_measurement(true_states(plain, sent), **offset, angle=angle, scale=scale), sent, plain
-    )
+    rows = rows_of(motion_capture_measurement(true_states(plain, sent), **offset, angle=angle), sent, plain)
     config = replace(plain, effects=effects)
     assert np.allclose(predicted(config, rows), rows.targets, atol=2e-5)
     assert error(predicted(plain, rows), rows, 0) > 0.01

@@ -33,7 +33,13 @@ def curve_values(name, size):
     return {name: {p.name: float(v) for p, v in zip(curve.parameters, drawn, strict=True)}}
 
 
-CURVE_SIZES = {"drive_map": 1.0, "front_tyre_map": 0.3, "rear_tyre_map": 0.3}
+CURVE_SIZES = {
+    "side_force_over_speed": 1.0,
+    "yaw_moment_over_speed": 1.0,
+    "drive_map": 1.0,
+    "front_tyre_map": 0.3,
+    "rear_tyre_map": 0.3,
+}
 CASES = {
     **TYPICAL,
     **{name: curve_values(name, size) for name, size in CURVE_SIZES.items()},
@@ -110,6 +116,7 @@ CASES = {
 
 THROTTLES = (-1, -0.6, -0.35, -0.2, -0.1, -0.04, 0, 0.04, 0.1, 0.2, 0.35, 0.6, 1)
 SPEEDS = (-4.5, -3, -2, -1, -0.5, 0, 0.5, 1, 2, 3, 4.5)
+FORCE_SPEEDS = (-3, -1.5, -0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, 4)
 SLIPS = (0, 0.04, 0.1, 0.2, 0.4, 0.8)
 ACCELERATIONS = {"front_tyre_map": (-6, -3, 0, 3, 6), "rear_tyre_map": (-8, -5, -2.5, 0, 2.5, 5, 8)}
 
@@ -133,6 +140,12 @@ def tyre_map_at(e, name, acceleration, slip):
     grid = np.hstack([np.zeros((len(knots), 1)), grid])
     within = [np.clip(acceleration, knots[0], knots[-1]), np.clip(slip, 0, SLIPS[-1])]
     return float(RegularGridInterpolator((knots, SLIPS), grid)(within)[0])
+
+
+def over_speed(e, name, speed):
+    """A curve over the speed by numpy's interpolation; its deviation is 0 at rest."""
+    values = list(e[name].values())
+    return float(np.interp(speed, FORCE_SPEEDS, [*values[:3], 0.0, *values[3:]]))
 
 
 def spinning_rims(e, p, vx, vy, r, demand, grip):
@@ -223,6 +236,10 @@ def reference_rates(t, s, d, u, p, e):
     if has("body_force"):
         q = e["body_force"]
         body_x, body_y, moment = body_x + q["forward"], body_y + q["left"], moment + q["moment"]
+    if has("side_force_over_speed"):
+        body_y += m * over_speed(e, "side_force_over_speed", vx)
+    if has("yaw_moment_over_speed"):
+        moment += m * over_speed(e, "yaw_moment_over_speed", vx)
     if has("coast_brake"):
         body_x -= e["coast_brake"]["coefficient"] * vx * math.exp(-((u / 0.05) ** 2))
 

@@ -1,14 +1,17 @@
-"""A measured curve as a rival of the named effects that it contains.
+"""Measured curves as rivals of named effects.
 
-A curve contains the named form as a special case, so it fits about as well if that form is the physics. If it predicts
-left-out blocks significantly better, by a relevant share of its own gain over the refit, the named form is not the
-physics: the residual is then described by the class of the curve. The initial states of the windows are free, because
-their errors hide most of the difference (``identification.free_initial_states``).
+A map of a command contains the named effects of this command as special cases, so it fits about as well if one of them
+is the physics. A side force and a yaw moment over the speed do not contain all effects that turn the car to one side;
+if one of these is the physics, they fit about as well or worse. If a curve predicts left-out blocks significantly
+better, by a relevant share of its own gain over the refit, the named effects are not the physics: the residual is then
+described by the class of the curve. The initial states of the windows are free, because their errors hide most of the
+difference (``identification.free_initial_states``).
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 from carlab.diagnosis.decisions import Alternatives, Condition
 from carlab.diagnosis.identification.block_jackknife import clustered_gain
@@ -16,31 +19,59 @@ from carlab.diagnosis.selection.problem import RunControl, SearchProblem, Search
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.rival_physics import RivalPhysics
 from sim_backends.effects import EFFECTS
-from sim_backends.effects.curves import SteeringCurve, ThrottleCurve
+from sim_backends.effects.body import LateralBias, TorqueSteer
+from sim_backends.effects.curves import SideForceOverSpeed, SteeringCurve, ThrottleCurve, YawMomentOverSpeed
+from sim_backends.effects.observations import MocapYawMisalignment
 from sim_backends.effects.steering import SteeringOffset
 
 log = logging.getLogger(__name__)
 
-RIVAL_CURVES: dict[str, tuple[str, ...]] = {SteeringCurve.id: (SteeringOffset.id,), ThrottleCurve.id: ()}
-"""Curves that are fitted in place of named effects, and the effects that are fitted with each. They have one dimension,
-so their fits take seconds."""
+
+@dataclass(frozen=True, slots=True)
+class RivalCurve:
+    """A measured curve of one dimension, whose fit takes seconds.
+
+    curve       id of the curve
+    beside      effects and further curves that are fitted with it
+    replaced    effects that it replaces, besides those that the curve represents
+    """
+
+    curve: str
+    beside: tuple[str, ...] = ()
+    replaced: tuple[str, ...] = ()
+
+    def replaces(self, effect: str) -> bool:
+        """Whether the curve is fitted in place of the effect."""
+        return effect in self.replaced or self.curve in EFFECTS[effect].represented_by
+
+
+_TO_ONE_SIDE = (LateralBias.id, SteeringOffset.id, TorqueSteer.id, MocapYawMisalignment.id)
+RIVAL_CURVES: dict[str, RivalCurve] = {
+    rival.curve: rival
+    for rival in (
+        RivalCurve(SteeringCurve.id, beside=(SteeringOffset.id,), replaced=(SteeringOffset.id,)),
+        RivalCurve(ThrottleCurve.id),
+        RivalCurve(SideForceOverSpeed.id, beside=(YawMomentOverSpeed.id,), replaced=_TO_ONE_SIDE),
+    )
+}
+"""By the id of the curve."""
 
 
 def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
-    """The first measured curve that explains significantly more than the accepted effects that it contains.
+    """The first measured curve that explains significantly more than the accepted effects that it replaces.
 
-    It is fitted with the other effects. None if no curve explains more, if no accepted effect is contained in a curve,
-    and after a search that was cut short: the curve may then imitate an effect that was not tried.
+    It is fitted with the other effects. None if no curve explains more, if no curve replaces an accepted effect, and
+    after a search that was cut short: the curve may then imitate an effect that was not tried.
     """
     if not found.is_complete:
         return None
-    for curve in RIVAL_CURVES:
-        contained = tuple(n for n in found.effects if _is_contained(n, curve))
-        if not contained or not _is_free(problem, curve) or control.stop():
+    for curve, rival_curve in RIVAL_CURVES.items():
+        replaced = tuple(n for n in found.effects if rival_curve.replaces(n))
+        if not replaced or not _is_free(problem, rival_curve) or control.stop():
             continue
-        control.progress(f"measured curve in place of {', '.join(contained)}", 0.96)
-        rival = curve_in_addition(problem, found, curve, tuple(n for n in found.effects if n not in contained))
-        if not control.are_confirmed(contained, _limits(problem, found, rival), len(found.effects)):
+        control.progress(f"measured curve in place of {', '.join(replaced)}", 0.96)
+        rival = curve_in_addition(problem, found, curve, tuple(n for n in found.effects if n not in replaced))
+        if not control.are_confirmed(replaced, _limits(problem, found, rival), len(found.effects)):
             return rival
     return None
 
@@ -48,8 +79,9 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
 def curve_in_addition(problem: SearchProblem, found: SearchResult, curve: str, names: tuple[str, ...]) -> RivalPhysics:
     """A curve and its effects, fitted together with ``names`` from the point of the accepted effects."""
     without = refit(problem, names, found.best, found.scale).fit
-    fit = refit(problem, (*names, *RIVAL_CURVES[curve], curve), found.best, found.scale).fit
-    return RivalPhysics(curve, fit, without.cost - fit.cost, names)
+    beside = RIVAL_CURVES[curve].beside
+    fit = refit(problem, (*names, *beside, curve), found.best, found.scale).fit
+    return RivalPhysics(curve, fit, without.cost - fit.cost, names, beside)
 
 
 def _limits(problem: SearchProblem, found: SearchResult, rival: RivalPhysics) -> Alternatives:
@@ -67,13 +99,8 @@ def _limits(problem: SearchProblem, found: SearchResult, rival: RivalPhysics) ->
     )
 
 
-def _is_contained(effect: str, curve: str) -> bool:
-    """Whether a curve with its effects contains the effect."""
-    return effect in RIVAL_CURVES[curve] or curve in EFFECTS[effect].represented_by
-
-
-def _is_free(problem: SearchProblem, curve: str) -> bool:
+def _is_free(problem: SearchProblem, rival: RivalCurve) -> bool:
     """Whether the base model has the curve and its effects, and neither it nor a curve with it is in the car file."""
     stated = problem.nominal.effects
-    in_car_file = curve in stated or any(c in stated for c in EFFECTS[curve].represented_by)
-    return not in_car_file and all(is_applicable(problem.nominal, e) for e in (curve, *RIVAL_CURVES[curve]))
+    in_car_file = any(c in stated for c in (rival.curve, *EFFECTS[rival.curve].represented_by))
+    return not in_car_file and all(is_applicable(problem.nominal, e) for e in (rival.curve, *rival.beside))

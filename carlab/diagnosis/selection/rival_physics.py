@@ -14,6 +14,7 @@ from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, Sea
 from carlab.diagnosis.selection.refit import refit, refit_candidate
 from carlab.diagnosis.selection.screening import screen_candidates
 from sim_backends.effects import EFFECTS, Disturbance, MeasuredCurve
+from sim_backends.effects.curves import free_knots
 
 log = logging.getLogger(__name__)
 
@@ -26,12 +27,14 @@ class RivalPhysics:
     fit      fit with it and with ``names``
     gain     fall of the cost with it
     names    effects of the catalogue in the fit
+    beside   effects and curves that are a part of this physics
     """
 
     effect: str
     fit: Fit
     gain: float
     names: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
 
     def class_statement(self) -> str:
         """Class of the physics."""
@@ -39,9 +42,24 @@ class RivalPhysics:
 
     def formula(self) -> str:
         """Fitted parameters in one line."""
-        values = self.fit.values()
-        numbers = ((p.name, values[f"effects.{self.effect}.{p.name}"], p.unit) for p in EFFECTS[self.effect].parameters)
-        return f"{self.effect}: " + ", ".join(f"{name} {value:.3g} {unit}".strip() for name, value, unit in numbers)
+        return "; ".join(_fitted_numbers(effect, self.fit) for effect in (self.effect, *self.beside))
+
+
+def _fitted_numbers(effect: str, fit: Fit) -> str:
+    """Fitted parameters of an effect, or the deviations of a curve at its knots."""
+    info, values = EFFECTS[effect], fit.values()
+    labels = [p.name for p in info.parameters]
+    if isinstance(info, MeasuredCurve):
+        places = free_knots(info.axes)
+        labels = [
+            "at " + ", ".join(f"{axis.knots[k]:g} {axis.unit}" for axis, k in zip(info.axes, place, strict=True))
+            for place in places
+        ]
+    numbers = (
+        f"{label} {values[f'effects.{effect}.{p.name}']:.3g} {p.unit}".strip()
+        for label, p in zip(labels, info.parameters, strict=True)
+    )
+    return f"{effect}: " + ", ".join(numbers)
 
 
 def replacing_physics(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
