@@ -1,4 +1,4 @@
-"""A measured throttle curve as a rival of named throttle effects, on drives of a car with a known throttle map."""
+"""Measured curves as rivals of named effects, on drives of a car with a known throttle map or a known yaw moment."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,11 +16,20 @@ from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
 from sim_backends.array_ops import ARRAYS, Ops, Value
-from sim_backends.effects import ActuatorEffect, EffectParameter, confusable_effects
+from sim_backends.effects import (
+    ActuatorEffect,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    MeasuredCurve,
+    confusable_effects,
+)
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
-CANDIDATES = ("throttle_nonlinearity", "throttle_asymmetry")
+THROTTLE_EFFECTS = ("throttle_nonlinearity", "throttle_asymmetry")
+SIDE_EFFECTS = ("lateral_bias", "torque_steer", "steering_offset", "mocap_yaw_misalignment")
+SPEEDS_MPS = np.array([0.5, 1.0, 1.5, 2.0])
 DRIVEN = np.array([-0.3, 0.1, 0.3, 0.5, 0.8])
 """Throttle commands of the drives."""
 NOISE = np.array([2e-3, 2e-3, 4e-3, 2e-2, 2e-2, 5e-2])
@@ -45,10 +54,25 @@ class WavyThrottle(ActuatorEffect):
         return command + values["size"] * ops.sin(command * (2.0 * np.pi / 0.25))
 
 
-def rival_of(true: SimulatorConfig) -> tuple[tuple[str, ...], RivalPhysics | None, list[Decision]]:
+class WavyMoment(DynamicsEffect):
+    """``M += size sin(2 pi vx / 4 m/s)``."""
+
+    id = "wavy_moment"
+    catalogued = False
+    summary = "A yaw moment is a wave over the speed."
+    class_statement = "a wave"
+    parameters = (EffectParameter("size", "N m", 0.0, -1.0, 1.0, 0.1),)
+
+    def on_body(self, ops: Ops, forces: Forces, values: Mapping[str, Value]) -> None:
+        forces.moment = forces.moment + values["size"] * ops.sin(forces.vx * (0.5 * np.pi))
+
+
+def rival_of(
+    true: SimulatorConfig, candidates: tuple[str, ...]
+) -> tuple[tuple[str, ...], RivalPhysics | None, list[Decision]]:
     """Effects found on a drive of the ``true`` car, the curve that replaces them, and the decisions about it."""
     windows = cut_windows(segments_of([drive(true, 60.0, 1)]), 1.0, 0.5)
-    problem = SearchProblem(CAR, windows, NOISE, NOISE, confusable_effects(), CANDIDATES, DEFAULT)
+    problem = SearchProblem(CAR, windows, NOISE, NOISE, confusable_effects(), candidates, DEFAULT)
     decisions: list[Decision] = []
     found = search(problem, RunControl())
     rival = replacing_curve(problem, found, RunControl(record=decisions.append))
@@ -57,7 +81,7 @@ def rival_of(true: SimulatorConfig) -> tuple[tuple[str, ...], RivalPhysics | Non
 
 def test_throttle_curve_replaces_effects_that_resemble_another_map() -> None:
     with registered(WavyThrottle()):
-        names, rival, decisions = rival_of(replace(CAR, effects={"wavy_throttle": {"size": 0.06}}))
+        names, rival, decisions = rival_of(replace(CAR, effects={"wavy_throttle": {"size": 0.06}}), THROTTLE_EFFECTS)
     assert names
     assert rival is not None
     assert (rival.effect, rival.names) == ("throttle_curve", ())
@@ -70,12 +94,35 @@ def test_throttle_curve_replaces_effects_that_resemble_another_map() -> None:
     assert np.abs(measured - wavy(DRIVEN)).max() < 0.2 * np.abs(DRIVEN - wavy(DRIVEN)).max()
 
 
+def test_forces_over_speed_replace_effects_that_turn_the_car_to_one_side() -> None:
+    with registered(WavyMoment()):
+        names, rival, _ = rival_of(replace(CAR, effects={"wavy_moment": {"size": 0.15}}), SIDE_EFFECTS)
+    assert names
+    assert rival is not None
+    assert (rival.effect, rival.beside, rival.names) == ("side_force_over_speed", ("yaw_moment_over_speed",), ())
+    formula = rival.formula()
+    assert formula.startswith("side_force_over_speed: at -3 m/s ")
+    assert "yaw_moment_over_speed: at -3 m/s " in formula
+    curve = EFFECTS["yaw_moment_over_speed"]
+    assert isinstance(curve, MeasuredCurve)
+    mass_kg = CAR.parameters.mass_kg
+    measured = mass_kg * curve.deviation(ARRAYS, (SPEEDS_MPS,), curve.numbers(rival.fit.values()))
+    assert measured == pytest.approx(0.15 * np.sin(0.5 * np.pi * SPEEDS_MPS), abs=0.03)
+
+
 @pytest.mark.parametrize(
-    ("effect", "values"),
-    [("throttle_nonlinearity", {"exponent": 1.4}), ("throttle_asymmetry", {"gain_ratio": 0.6})],
+    ("effect", "values", "candidates"),
+    [
+        ("throttle_nonlinearity", {"exponent": 1.4}, THROTTLE_EFFECTS),
+        ("throttle_asymmetry", {"gain_ratio": 0.6}, THROTTLE_EFFECTS),
+        ("torque_steer", {"coefficient": 0.1}, SIDE_EFFECTS),
+        ("lateral_bias", {"force": 1.0}, SIDE_EFFECTS),
+    ],
 )
-def test_throttle_curve_does_not_replace_a_true_effect(effect: str, values: dict[str, float]) -> None:
-    names, rival, decisions = rival_of(replace(CAR, effects={effect: values}))
+def test_curve_does_not_replace_a_true_effect(
+    effect: str, values: dict[str, float], candidates: tuple[str, ...]
+) -> None:
+    names, rival, decisions = rival_of(replace(CAR, effects={effect: values}), candidates)
     assert names == (effect,)
     assert rival is None
     assert [(d.effect, d.passed) for d in decisions] == [(effect, True)]
