@@ -8,6 +8,7 @@ import pytest
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.recording_faults.find import check
 from carlab.recording.faults.heading import heading_faults
+from carlab.recording.pose_velocity import pose_motion
 from sim_backends.car_parameters import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive, driven
 
@@ -78,3 +79,11 @@ def test_yaw_offset_is_no_scale_of_true_velocities(clean: EpisodeData, offset_de
     vx, vy = clean.states[:, 3:5].T
     along = np.cos(offset_rad) * vx + np.sin(offset_rad) * vy
     np.testing.assert_allclose(found.states[5:-5, 3], along[5:-5], atol=0.1)
+
+
+def test_velocities_of_a_repaired_pose_are_estimated_as_by_the_import(clean: EpisodeData) -> None:
+    x, y, yaw = clean.states.T[:3]
+    motion = pose_motion(clean.times_s, x, y, yaw, np.zeros(len(x)), for_states=True)
+    states = np.column_stack([x, y, yaw + np.pi, motion.vx, motion.vy, motion.yaw_rate])
+    (found,), _, _ = check([replace(clean, states=states, metadata={"velocity_source": "pose"})], [], NOMINAL)
+    np.testing.assert_allclose(found.states[:, 3:], np.column_stack([motion.vx, motion.vy, motion.yaw_rate]), atol=1e-9)

@@ -34,7 +34,7 @@ class EpisodeRepair:
         segment: number of the unbroken stretch (N,).
         rows: indices (N,) of the remaining rows in the recording.
         interpolated: whether the pose of a row was interpolated (N,).
-        has_velocity_columns: False if the velocities are estimated from the pose.
+        has_velocity_columns: False if the velocities are estimated from the pose of the repaired rows.
         faults: faults found, with the action taken.
         is_changed: whether anything was repaired.
     """
@@ -71,10 +71,14 @@ class EpisodeRepair:
         """Whether there are enough rows to check, with all numbers finite."""
         return len(self.times_s) >= MIN_ROWS and not _missing_numbers(self.episode)[self.rows].any()
 
-    def motion(self) -> PoseMotion:
-        """Motion estimated from the pose."""
+    def motion(self, *, for_states: bool = False) -> PoseMotion:
+        """Motion estimated from the pose; ``for_states`` as for ``pose_motion``."""
         x, y, yaw = self.states.T[:3]
-        return pose_motion(self.times_s, x, y, yaw, self.segment)
+        return pose_motion(self.times_s, x, y, yaw, self.segment, for_states=for_states)
+
+    def set_velocities(self, motion: PoseMotion) -> None:
+        """Replace the velocities by those of a motion."""
+        self.states[:, 3:] = np.column_stack([motion.vx, motion.vy, motion.yaw_rate])
 
     def cut_at_jumps(self) -> int:
         """Split into segments at gaps and jumps of the pose. Returns the number of jumps."""
@@ -136,8 +140,7 @@ class EpisodeRepair:
         if not self.is_changed:
             return self.episode
         if not self.has_velocity_columns:
-            motion = self.motion()
-            self.states[:, 3:] = np.column_stack([motion.vx, motion.vy, motion.yaw_rate])
+            self.set_velocities(self.motion(for_states=True))
         extra = {name: column[self.rows] for name, column in self.episode.extra.items() if name != "segment"}
         is_incomplete = _missing_numbers(self.episode).any(axis=1)
         segment = self.segment + np.cumsum(is_incomplete)[self.rows]

@@ -52,7 +52,7 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
     for k, fault in late.items():
         if k in clocks and not (alike and len(clocks) < len(repairs)):
             _rebuild_clock(repairs[k], *clocks[k])
-        repairs[k].has_velocity_columns = False
+        repairs[k].set_velocities(repairs[k].motion())
         repairs[k].repaired(fault, "the velocities were estimated from the pose without delay")
 
 
@@ -84,10 +84,12 @@ def _check_scale(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> Non
     reference, rows = velocity_references(motion)[channel], comparable_rows(motion, channel)
     for fault in scale_faults(channel, fit_column(repair.times_s, reference, column, rows), reference[rows]):
         factor = fault.evidence.get("factor")
-        column[:] = reference if factor is None else factor * column
-        repair.repaired(
-            fault, "replaced by the velocity of the pose" if factor is None else f"multiplied by {factor:.4g}"
-        )
+        if factor is None:
+            repair.has_velocity_columns = False
+            repair.repaired(fault, "the velocities were estimated from the pose")
+        else:
+            column *= factor
+            repair.repaired(fault, f"multiplied by {factor:.4g}")
 
 
 def _check_spikes(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> None:
