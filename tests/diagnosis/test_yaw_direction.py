@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from carlab.core.episode_data import EpisodeData
+from carlab.core.planar import to_body
 from carlab.diagnosis.recording_faults.find import check
 from carlab.recording.faults.heading import heading_faults
 from carlab.recording.pose_velocity import pose_motion
@@ -79,6 +80,17 @@ def test_yaw_offset_is_no_scale_of_true_velocities(clean: EpisodeData, offset_de
     vx, vy = clean.states[:, 3:5].T
     along = np.cos(offset_rad) * vx + np.sin(offset_rad) * vy
     np.testing.assert_allclose(found.states[5:-5, 3], along[5:-5], atol=0.1)
+
+
+@pytest.mark.parametrize("offset_deg", [90.0, -90.0, 180.0])
+def test_a_body_mounted_at_a_right_angle_is_repaired_exactly(clean: EpisodeData, offset_deg: float) -> None:
+    """The tracked body is rotated in the car, and so are the velocities of motion capture in its frame."""
+    states, offset_rad = clean.states.copy(), np.deg2rad(offset_deg)
+    states[:, YAW] += offset_rad
+    states[:, 3], states[:, 4] = to_body(*clean.states[:, 3:5].T, np.asarray(offset_rad))
+    (found,), _, _ = check([replace(clean, states=states, metadata={"velocity_source": "column"})], [], NOMINAL)
+    assert yaw_error(found, clean).max() < 1e-9
+    np.testing.assert_allclose(found.states[:, 3:5], clean.states[:, 3:5], atol=0.02)
 
 
 def test_velocities_of_a_repaired_pose_are_estimated_as_by_the_import(clean: EpisodeData) -> None:

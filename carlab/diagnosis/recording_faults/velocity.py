@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from carlab.core.planar import to_body
+from carlab.core.planar import to_body, to_world
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
 from carlab.recording.audit.audit import Channels
 from carlab.recording.column_mapping import POSE_CHANNELS, VELOCITY_CHANNELS
@@ -61,8 +61,9 @@ def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
     _check_frame(repair, motion)
     rotated = rotated_velocity(repair.states[:, 3:5].T, motion)
     if rotated is not None:  # Which of yaw and velocities is right, the diagnosis finds by mocap_yaw_misalignment.
-        repair.states[:, 3], repair.states[:, 4] = motion.vx, motion.vy
-        repair.repaired(rotated, "vx and vy were estimated from the pose")
+        vx, vy = repair.states[:, 3:5].T.copy()
+        repair.states[:, 3], repair.states[:, 4] = to_world(vx, vy, np.asarray(rotated.evidence["offset_rad"]))
+        repair.repaired(rotated, "vx and vy were rotated by that angle")
     for channel in VELOCITY_CHANNELS:
         _check_scale(repair, motion, channel)
     for channel in VELOCITY_CHANNELS:

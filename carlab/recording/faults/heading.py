@@ -81,7 +81,7 @@ def _yaw_faults(path: _Course) -> list[Fault]:
         )
         faults = [Fault("wrong_unit", "yaw", degrees, evidence, "--yaw-unit deg")] if best[0] == "deg" else []
         return faults + ([_clockwise(means[best], declared, evidence)] if best[1] < 0 else [])
-    offset = _offset(path, float(np.angle(means["rad", 1])) / 2)
+    offset = _near_right_angle(_offset(path, float(np.angle(means["rad", 1])) / 2))
     if declared <= LIMITS.heading_concentration or abs(offset) <= LIMITS.heading_offset_rad:
         return []
     observation = f"the car moves {np.rad2deg(offset):.0f} degrees away from its yaw on average: yaw has another axis"
@@ -98,6 +98,12 @@ def _clockwise(mean: complex, declared: float, evidence: Mapping[str, float]) ->
     )
     option = "--swap-xy" if exchanged else "--yaw-sign -1"
     return Fault("wrong_frame" if exchanged else "wrong_sign", "yaw", observation, evidence, option)
+
+
+def _near_right_angle(offset: float) -> float:
+    """The multiple of a right angle [rad] nearest to ``offset``, if a misplaced rigid body can make the difference."""
+    right_angle = np.pi / 2 * round(offset / (np.pi / 2))
+    return float(right_angle) if abs(offset - right_angle) <= LIMITS.heading_offset_rad else offset
 
 
 def _offset(path: _Course, mean: float) -> float:

@@ -67,6 +67,8 @@ class FaultSettings:
 
     rotated_rad: float = math.radians(5.0)
     """[rad] Minimum rotation between velocities and pose that is a fault. A marker off the centre causes 3 degrees."""
+    reversed_rad: float = math.radians(135.0)
+    """[rad] Velocities that are rotated by more have wrong signs."""
     rotated_ratio: float = 0.3
     """A rotation is accepted if it leaves less than this share of the difference of velocities and pose."""
 

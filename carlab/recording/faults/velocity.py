@@ -69,7 +69,7 @@ def rotated_velocity(velocity: FloatArray, motion: PoseMotion) -> Fault | None:
     error = np.abs(column - own)
     error_rotated = np.abs(column * np.exp(-1j * angle_rad) - own)
     is_rotated = float(np.median(error_rotated)) < LIMITS.rotated_ratio * float(np.median(error))
-    if not is_rotated or not LIMITS.rotated_rad < abs(angle_rad) < np.pi / 2.0:
+    if not is_rotated or not LIMITS.rotated_rad < abs(angle_rad) < LIMITS.reversed_rad:
         return None
     observation = (
         f"vx and vy are rotated by {np.rad2deg(angle_rad):.0f} degrees against the motion of the pose: the yaw has "
