@@ -35,6 +35,7 @@ class Car:
     velocity_lag_s: float = 0.0
     drag: float = 1.2
     mean_steering: float = 0.0
+    rear_axle_m: float = 0.02
 
     def drive(self) -> EpisodeData:
         rng = np.random.default_rng(self.seed)
@@ -62,7 +63,7 @@ class Car:
         target_rate = speed * np.tan(0.4 * delayed(steering, self.steering_delay_s)) / 0.3
         rate = lfilter([step / 0.06], [1.0, step / 0.06 - 1.0], target_rate)
         yaw = np.cumsum(rate) * step
-        lateral_speed = 0.02 * rate
+        lateral_speed = self.rear_axle_m * rate
         x = np.cumsum(speed * np.cos(yaw) - lateral_speed * np.sin(yaw)) * step
         y = np.cumsum(speed * np.sin(yaw) + lateral_speed * np.cos(yaw)) * step
         poses = np.column_stack([x, y, yaw])[::steps_per_row]
@@ -171,6 +172,19 @@ def test_unit_scale_and_sign_of_a_velocity_column_are_repaired(clean, identity, 
     assert faults[0].action.startswith("repaired")
     assert faults[0].rows == len(clean.states)
     np.testing.assert_allclose(fit.states[:, column], clean.states[:, column], rtol=0.03, atol=1e-6)
+
+
+def test_velocities_of_wheel_odometry_are_replaced_by_those_of_the_pose():
+    """Wheels measure the speed along the car: ``vy`` is zero although the centre of mass moves sideways."""
+    true = Car(rear_axle_m=0.12).drive()
+    odometry = with_states(true, lambda states: states.__setitem__((slice(None), VY), 0.0))
+    (fit,), _, (fault,) = check([odometry], [], NOMINAL)
+    assert (fault.id, fault.channel, fault.action) == (
+        "column_scale",
+        "vy",
+        "repaired: vy does not follow the motion of the pose; the velocities were estimated from the pose.",
+    )
+    np.testing.assert_allclose(fit.states[:, VY], true.states[:, VY], atol=0.12)
 
 
 def test_velocities_in_the_world_frame_are_rotated_to_the_body_frame(clean):

@@ -60,6 +60,10 @@ class FaultSettings:
     """Unexplained variance up to which the sign of a column is accepted (correlation 0.87)."""
     unrelated_unexplained: float = 0.9
     """Unexplained variance from which a column does not measure the motion of the pose."""
+    constant_scale: float = 1e-3
+    """Scale below which a velocity column does not change with the motion of the pose, as vy of wheel odometry."""
+    constant_mps: float = 0.05
+    """[m/s, rad/s] Such a column is a fault if the motion of the pose is larger. Noise of 2 mm leaves 0.02 m/s."""
     frame_unexplained: float = 0.05
     """Unexplained variance up to which the declared frame is accepted; lag and noise leave less."""
     frame_ratio: float = 0.3

@@ -99,7 +99,8 @@ def scale_faults(channel: str, fit: ColumnFit, reference: FloatArray) -> list[Fa
     """
     size, rms = abs(fit.scale), math.sqrt(float(np.mean(reference**2)))
     evidence = {"slope": fit.scale, "unexplained": fit.unexplained}
-    if rms > 0.3 and (fit.unexplained > LIMITS.unrelated_unexplained or size < 1e-3):
+    is_constant = size < LIMITS.constant_scale and rms > LIMITS.constant_mps
+    if is_constant or (rms > 0.3 and fit.unexplained > LIMITS.unrelated_unexplained):
         observation = f"{channel} does not follow the motion of the pose"
         return [Fault("column_scale", channel, observation, evidence, "--velocities pose")]
     if fit.unexplained > LIMITS.sign_unexplained or rms < 1e-6 or size == 0.0:
