@@ -38,6 +38,15 @@ def test_simulator_accepts_the_bounds_of_every_effect(kind, effect, z):
     assert {name: reached[name] for name in values} == values
 
 
+@pytest.mark.parametrize("z", [-1e3, 1e3])
+def test_range_of_the_car_file_bounds_the_parameter_of_an_effect(z):
+    """The car file f1tenth states a range of the force; a fit beyond it ended the diagnosis with an error."""
+    car = SimulatorConfig.from_preset("f1tenth")
+    free = effect_parameters("speed_controller", car)
+    values = {f.name: float(f.value(np.array(z))) for f in free}
+    assert car.with_values(values).values()["effects.speed_controller.forward_force"] == (10.0 if z < 0.0 else 80.0)
+
+
 @pytest.mark.parametrize(("z", "at_limit"), [(0.5, False), (-1e3, True), (1e3, True)])
 def test_estimate_states_that_a_fit_ended_at_a_bound(z, at_limit):
     free = effect_parameters("steering_rate_limit", SimulatorConfig())

@@ -121,7 +121,7 @@ def base_parameters(config: SimulatorConfig, *, uses_std: bool = False) -> tuple
 def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParameter, ...]:
     """Parameters of one effect; z = 0 is the value that the car file states, or else the identity value.
 
-    A negative extra delay is at most the delay of the car file.
+    A negative extra delay is at most the delay of the car file. A range in the car file bounds its parameter.
     """
     found = []
     values, stated_by_name = config.values(), stated_values(config, effect_id)
@@ -143,7 +143,13 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
                 low = max(low, -values[p.reduces])
             high = min(p.high, max(identity + 20.0 * size, origin))
             found.append(FitParameter(name, origin, size, low, high, is_delay=p.is_delay))
-    return tuple(found)
+    return tuple(_within_range(each, config) for each in found)
+
+
+def _within_range(parameter: FitParameter, config: SimulatorConfig) -> FitParameter:
+    """The parameter with the range of the car file as bounds, if the car file states one."""
+    low, high = config.priors.get(parameter.name, (parameter.low, parameter.high))
+    return replace(parameter, low=max(parameter.low, low), high=min(parameter.high, high))
 
 
 def tyre_effects(config: SimulatorConfig) -> tuple[str, ...]:
