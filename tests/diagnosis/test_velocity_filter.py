@@ -168,3 +168,13 @@ def test_search_without_other_candidates_or_time_names_the_filter():
         episode(filtered_velocities(0.1)), carlab.load_car("rc_car"), effects=[FILTER], budget_s=30.0, stop=lambda: True
     )
     assert list(report.effects) == [FILTER]
+
+
+def test_no_filter_is_measured_against_slow_poses():
+    """Velocities of poses at 10 Hz attenuate the motion themselves, as a filter does."""
+    rows = slice(None, None, 3)
+    slow = episode(filtered_velocities(0.15))
+    commands = slow.sent[::3][: len(slow.times_s[rows]) - 1]
+    changed = {"times_s": slow.times_s[rows], "states": slow.states[rows], "poses": slow.poses[rows]}
+    slow = replace(slow, requested=commands, sent=commands, rewards=np.zeros(len(commands)), **changed)
+    assert velocity_filter(segments_of([slow])) is None

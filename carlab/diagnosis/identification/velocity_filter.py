@@ -106,8 +106,10 @@ class _Velocity:
 def velocity_filter(segments: Sequence[RecordingSegment]) -> VelocityFilter | None:
     """The filter of the velocities of recordings; None if a dead time explains them about as well.
 
-    All segments have the same period.
+    All segments have the same period. Above ``velocity_max_period_s`` the poses give no velocity to compare with.
     """
+    if segments[0].period_s > IDENTIFICATION.velocity_max_period_s:
+        return None
     rows = _Rows.of(segments)
     if len(rows.index) < IDENTIFICATION.filter_min_rows:
         return None
