@@ -315,6 +315,13 @@ def test_delays_of_both_commands_do_not_contradict_each_other() -> None:
         assert "later than" not in sentence
 
 
+@pytest.mark.parametrize(("seconds", "at_limit", "is_late"), [(-0.06, True, True), (-0.06, False, False)])
+def test_a_delay_of_zero_is_a_log_with_late_commands(seconds: float, at_limit: bool, is_late: bool) -> None:
+    delay = replace(around(seconds, "s"), at_limit=at_limit)
+    sentence = effect_sentence("command_delay", {"extra_delay": delay})
+    assert ("the log may have the commands later than they act" in sentence) is is_late
+
+
 def test_number_at_a_limit_without_information_has_no_interval() -> None:
     at_limit = Estimate(0.0, 0.0, 0.0, 0.0, "s", at_limit=True)
     sentence = effect_sentence("mocap_latency", {"latency": at_limit})

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from carlab.diagnosis.findings import Diagnosis, Estimate
 from carlab.diagnosis.report.numbers import listed, with_unit
 from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
+
+
+def late_commands(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
+    """Sentence about a delay that reaches zero: the log may have the commands too late. Empty for other effects."""
+    if effect_id not in EFFECTS:
+        return ""
+    reducing = [parameters.get(p.name) for p in EFFECTS[effect_id].parameters if p.reduces]
+    if not any(e is not None and e.at_limit and e.value < 0.0 for e in reducing):
+        return ""
+    return (
+        " No delay is left: the log may have the commands later than they act. Correct it with carlab import "
+        "--command-lag."
+    )
 
 
 def wrong_parameters(diagnosis: Diagnosis) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
 from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
-from carlab.diagnosis.report.parameters import excluded_sizes, parameters_at_limit, wrong_parameters
+from carlab.diagnosis.report.parameters import excluded_sizes, late_commands, parameters_at_limit, wrong_parameters
 from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import EVIDENCE, REPORT
@@ -113,7 +113,7 @@ def effect_sentence(
     fields = _Fields({name: _Filled(e) for name, e in parameters.items()})
     filled = re.sub(r"\s+", " ", effect.sentence.format_map(fields))
     head, level, tail = filled.partition(AT_90)  # only the first interval states the level
-    return f"Left out: {head}{level}{tail.replace(AT_90, '')}."
+    return f"Left out: {head}{level}{tail.replace(AT_90, '')}.{late_commands(effect_id, parameters)}"
 
 
 def _wrong_numbers(effect_id: str, parameters: Mapping[str, Estimate], car_file_values: Mapping[str, float]) -> str:
@@ -377,8 +377,8 @@ def _different_when_held_out(diagnosis: Diagnosis) -> str:
     return (
         f"The refitted simulator agrees with the fitted recordings ({number(diagnosis.fitted_score)} noise floors) but "
         f"not with the held-out ones ({number(held.score)} noise floors, {with_unit(held.position_m, 'm')} after "
-        f"{with_unit(diagnosis.horizon_s, 's')}). The car or the motion capture changed between them, or the held-out "
-        "recordings have conditions that the fitted ones lack."
+        f"{with_unit(diagnosis.horizon_s, 's')}). The car or the motion capture changed between them (carlab compare "
+        "finds what), or the held-out recordings have conditions that the fitted ones lack."
     )
 
 
