@@ -187,6 +187,18 @@ def test_velocities_of_wheel_odometry_are_replaced_by_those_of_the_pose():
     np.testing.assert_allclose(fit.states[:, VY], true.states[:, VY], atol=0.12)
 
 
+@pytest.mark.parametrize("rows", [1, 2])
+def test_velocities_that_precede_late_poses_are_replaced(clean, rows):
+    """One delay of motion capture explains poses and velocities only if both have it."""
+    states = clean.states[rows:].copy()
+    states[:, :3] = clean.states[:-rows, :3]
+    late = without_rows(clean, np.arange(len(clean.states)) < rows, states)
+    (fit,), _, (fault,) = check([late], [], NOMINAL)
+    assert (fault.id, fault.channel) == ("column_shift", "vx, vy, yaw_rate")
+    assert "the poses are late" in fault.action
+    np.testing.assert_allclose(fit.states[5:-5, VX], clean.states[5:-rows, VX][:-5], atol=0.1)
+
+
 def test_velocities_in_the_world_frame_are_rotated_to_the_body_frame(clean):
     def change(states):
         c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,8 +16,10 @@ from carlab.recording.faults.robust import fit_column
 from carlab.recording.faults.settings import LIMITS
 from carlab.recording.faults.stamps import nominal_clock
 from carlab.recording.faults.velocity import (
+    MIN_COMPARED_ROWS,
     backward_differences,
     comparable_rows,
+    early_velocities,
     rotated_velocity,
     scale_faults,
     spike_fault,
@@ -27,20 +29,20 @@ from carlab.recording.faults.velocity import (
 )
 from carlab.recording.pose_velocity import PoseMotion
 
-MIN_MOVING_ROWS = 60
-
 
 def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
     """Check and repair vx, vy and yaw rate of recordings: frame, scale, spikes, backward differences.
 
     Args:
         repairs: the recordings.
-        alike: whether backward differences and nominal stamps are repaired only if all recordings have them.
+        alike: whether early velocities, backward differences and nominal stamps are repaired only if all recordings
+            have them.
     """
     motions = {k: r.motion() for k, r in enumerate(repairs) if r.has_velocity_columns}
-    motions = {k: m for k, m in motions.items() if comparable_rows(m, "vx").sum() >= MIN_MOVING_ROWS}
+    motions = {k: m for k, m in motions.items() if comparable_rows(m, "vx").sum() >= MIN_COMPARED_ROWS}
     for k, motion in motions.items():
         _check_columns(repairs[k], motion)
+    _replace_early(repairs, motions, alike=alike)
     found = {
         k: backward_differences(repairs[k].times_s, repairs[k].states, repairs[k].segment, m)
         for k, m in motions.items()
@@ -54,6 +56,17 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
             _rebuild_clock(repairs[k], *clocks[k])
         repairs[k].set_velocities(repairs[k].motion())
         repairs[k].repaired(fault, "the velocities were estimated from the pose without delay")
+
+
+def _replace_early(repairs: Sequence[EpisodeRepair], motions: Mapping[int, PoseMotion], *, alike: bool) -> None:
+    """Estimate velocities from the pose where the columns precede it; ``alike`` as for ``check_velocities``."""
+    found = {k: early_velocities(repairs[k].times_s, repairs[k].states, motion) for k, motion in motions.items()}
+    early = {k: fault for k, fault in found.items() if fault is not None}
+    if alike and len(early) < len(repairs):
+        return
+    for k, fault in early.items():
+        repairs[k].has_velocity_columns = False
+        repairs[k].repaired(fault, "the velocities were estimated from the pose")
 
 
 def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:

@@ -16,11 +16,13 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.recording.column_mapping import UNITS, VELOCITY_CHANNELS
 from carlab.recording.faults.fault import Fault
-from carlab.recording.faults.robust import ColumnFit, fit_column, robust_std
+from carlab.recording.faults.robust import LAGS_S, ColumnFit, fit_column, robust_std
 from carlab.recording.faults.settings import LIMITS
 from carlab.recording.pose_velocity import BoolArray, PoseMotion
 
 Frame = Literal["body", "world"]
+MIN_COMPARED_ROWS = 60
+"""Minimum number of rows with motion for a comparison of a velocity with the pose."""
 
 
 def velocity_references(motion: PoseMotion, frame: Frame = "body") -> dict[str, FloatArray]:
@@ -190,9 +192,32 @@ def velocity_lag(channel: str, period_s: float, fit: ColumnFit) -> Fault | None:
         "remainder": fit.residual_rms,
         "remainder_unshifted": fit.rms * math.sqrt(fit.unexplained_unshifted),
     }
-    verb = "lag" if "," in channel else "lags"
-    observation = f"{channel} {verb} the differentiated pose by {fit.lag_s * 1e3:.0f} ms ({rows:.2f} rows{like})"
+    verb = ("lag" if rows > 0.0 else "precede") + ("" if "," in channel else "s")
+    size = f"{abs(fit.lag_s) * 1e3:.0f} ms ({abs(rows):.2f} rows{like})"
+    observation = f"{channel} {verb} the differentiated pose by {size}"
     return Fault("column_shift", channel, observation, evidence, "--velocities pose")
+
+
+def early_velocities(t_s: FloatArray, states: FloatArray, motion: PoseMotion) -> Fault | None:
+    """Velocities in ``states`` (N, 6) that precede the motion of its poses by half a row or more.
+
+    A filter makes velocities late, not early. So the poses have another delay than the velocities, for example a
+    gyroscope beside motion capture with latency. vx and yaw rate must agree, because vy is often noise.
+    """
+    period_s = float(np.median(np.diff(t_s)))
+    references = velocity_references(motion)
+    found = []
+    for channel in ("vx", "yaw_rate"):
+        column, rows = states[:, 3 + VELOCITY_CHANNELS.index(channel)], comparable_rows(motion, channel)
+        if rows.sum() < MIN_COMPARED_ROWS:
+            return None
+        fit = fit_column(t_s, references[channel], column, rows, lags_s=LAGS_S, time_constants_s=(0.0,))
+        found.append(velocity_lag(channel, period_s, fit))
+    if any(fault is None or fault.evidence["rows"] > -0.5 for fault in found):
+        return None
+    lead_s = -float(np.mean([fault.evidence["lag_s"] for fault in found if fault is not None]))
+    observation = f"the velocities precede the motion of the pose by {lead_s * 1e3:.0f} ms: the poses are late"
+    return Fault("column_shift", "vx, vy, yaw_rate", observation, {"lead_s": lead_s}, "--velocities pose")
 
 
 def backward_differences(t_s: FloatArray, states: FloatArray, segment: FloatArray, motion: PoseMotion) -> Fault | None:
