@@ -20,6 +20,7 @@ from carlab.recording.faults.commands import (
     CommandResponse,
     GridMotion,
     command_response,
+    exchanged_commands,
     grid_motion,
     moves_backward,
     reversed_yaw,
@@ -64,6 +65,8 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
     motions = _motions_after_clock_offsets(repairs, expected_s)
     pairs = list(zip(repairs, motions, strict=True))
     by_recording = [_responses(repair, motion) for repair, motion in pairs]
+    if _exchange_columns(repairs, motions, by_recording):
+        by_recording = [_responses(repair, motion) for repair, motion in pairs]
     is_restamped = _check_clock(repairs, motions, by_recording)
     by_recording = [
         _responses(*pair) if is_new else found
@@ -75,6 +78,30 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
         if clear:
             _check_sign(repairs, clear, channel)
             _check_shift(repairs, responses, channel, expected_s)
+
+
+def _exchange_columns(
+    repairs: Sequence[EpisodeRepair],
+    motions: Sequence[GridMotion],
+    responses: Sequence[Sequence[CommandResponse | None]],
+) -> bool:
+    """Exchange both commands of the recordings with that fault, and of all if none follows a command of its own."""
+    faults = [
+        exchanged_commands(motion, repair.times_s, list(repair.commands.T), own)
+        for repair, motion, own in zip(repairs, motions, responses, strict=True)
+    ]
+    known = next((fault for fault in faults if fault is not None), None)
+    follows_own = any(
+        r is not None and r.best >= share
+        for own in responses
+        for r, share in zip(own, LIMITS.command_explained, strict=True)
+    )
+    for repair, own_fault in zip(repairs, faults, strict=True):
+        fault = own_fault if follows_own else known
+        if fault is not None:
+            repair.commands = repair.commands[:, ::-1].copy()
+            repair.repaired(fault, "the columns were exchanged")
+    return known is not None
 
 
 def _motions_after_clock_offsets(repairs: Sequence[EpisodeRepair], expected_s: float) -> list[GridMotion]:

@@ -29,6 +29,7 @@ from carlab.recording.faults.commands import (
     CommandResponse,
     GridMotion,
     command_response,
+    exchanged_commands,
     grid_motion,
     moves_backward,
     reversed_yaw,
@@ -300,6 +301,11 @@ def _check_commands(
     offset = clock_offset(grid, t_s - mapping.command_lag_s, list(sent.values()))
     if offset is not None:  # with another clock, sign and delay mean nothing
         return [_clock_finding(offset, t_s, mapping)]
+    lagged_s = t_s - mapping.command_lag_s
+    exchanged = exchanged_commands(grid, lagged_s, list(sent.values()), list(responses.values()))
+    if exchanged is not None:  # the columns of the file, before sign and delay
+        names = " and ".join(f"'{mapping.columns[channel].name}'" for channel in COMMAND_CHANNELS)
+        return [Finding.of_fault(exchanged, remedy=f"exchange the columns {names} in the mapping")]
     is_long = grid.rows.sum() >= MIN_ROWS
     for index, (channel, response) in enumerate(responses.items()):
         command = held_at(t_s, sent[channel], -mapping.command_lag_s)

@@ -218,6 +218,32 @@ def wrong_command_sign(channel: str, response: CommandResponse, evidence: Mappin
     return Fault("wrong_sign", channel, observation, evidence or {}, f"--{channel}-sign -1")
 
 
+def exchanged_commands(
+    motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatArray], responses: Sequence[CommandResponse | None]
+) -> Fault | None:
+    """The fault of exchanged columns: each command explains the motion of the other one, and not its own.
+
+    Args:
+        motion: motion on the grid.
+        t_s: stamps (N,).
+        commands: steering and throttle, (N,) each.
+        responses: responses to these commands.
+    """
+    if any(r is None or r.best >= share for r, share in zip(responses, LIMITS.command_explained, strict=True)):
+        return None
+    explained = []
+    for channel, command, share in zip(COMMAND_CHANNELS, reversed(commands), LIMITS.command_explained, strict=True):
+        response = command_response(motion, t_s, command, channel)
+        if response is None or response.best < share:
+            return None
+        explained.append(response.best)
+    observation = (
+        f"steering and throttle are exchanged: the throttle explains {explained[0]:.0%} of the turns, and the steering "
+        f"{explained[1]:.0%} of the acceleration"
+    )
+    return Fault("exchanged_columns", "steering, throttle", observation)
+
+
 def moves_backward(motion: PoseMotion) -> bool:
     """Whether the car moves backward by its yaw in most of the rows in which it moves."""
     moving = np.abs(motion.vx) > MIN_MPS

@@ -1,0 +1,70 @@
+"""Mistakes of a log are faults of the recording and no physics: other sensors, late poses, exchanged columns."""
+
+import numpy as np
+import pytest
+
+from carlab.core.episode_data import EpisodeData
+from carlab.diagnosis.recording_faults.find import check
+from carlab.recording.csv.export import write_csv
+from carlab.recording.csv.foreign import import_csv
+from tests.helpers.kinematic_drives import NOMINAL, Car, with_sent, with_states, without_rows
+
+VX, VY = 3, 4
+
+
+@pytest.fixture(scope="module")
+def clean() -> EpisodeData:
+    return Car().drive()
+
+
+@pytest.fixture(scope="module")
+def held() -> EpisodeData:
+    return Car(seed=1, seconds=40.0).drive()
+
+
+def exchange(sent: np.ndarray) -> None:
+    sent[:] = sent[:, ::-1].copy()
+
+
+def test_velocities_of_wheel_odometry_are_replaced_by_those_of_the_pose():
+    """Wheels measure the speed along the car: ``vy`` is zero although the centre of mass moves sideways."""
+    true = Car(rear_axle_m=0.12).drive()
+    odometry = with_states(true, lambda states: states.__setitem__((slice(None), VY), 0.0))
+    (fit,), _, (fault,) = check([odometry], [], NOMINAL)
+    assert (fault.id, fault.channel, fault.action) == (
+        "column_scale",
+        "vy",
+        "repaired: vy does not follow the motion of the pose; the velocities were estimated from the pose.",
+    )
+    np.testing.assert_allclose(fit.states[:, VY], true.states[:, VY], atol=0.12)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_velocities_that_precede_late_poses_are_replaced(clean, rows):
+    """One delay of motion capture explains poses and velocities only if both have it."""
+    states = clean.states[rows:].copy()
+    states[:, :3] = clean.states[:-rows, :3]
+    late = without_rows(clean, np.arange(len(clean.states)) < rows, states)
+    (fit,), _, (fault,) = check([late], [], NOMINAL)
+    assert (fault.id, fault.channel) == ("column_shift", "vx, vy, yaw_rate")
+    assert "the poses are late" in fault.action
+    np.testing.assert_allclose(fit.states[5:-5, VX], clean.states[5:-rows, VX][:-5], atol=0.1)
+
+
+def test_exchanged_command_columns_are_repaired(clean, held):
+    fit, out, faults = check([with_sent(clean, exchange)], [with_sent(held, exchange)], NOMINAL)
+    assert [(f.id, f.channel) for f in faults] == [("exchanged_columns", "steering, throttle")]
+    np.testing.assert_array_equal(fit[0].sent, clean.sent)
+    np.testing.assert_array_equal(out[0].sent, held.sent)
+
+
+def test_audit_names_exchanged_command_columns(clean, tmp_path):
+    write_csv(with_sent(clean, exchange), tmp_path / "drive.csv")
+    (finding,) = import_csv(tmp_path / "drive.csv").report.of("exchanged_columns")
+    assert "exchange the columns 'steering' and 'throttle' in the mapping" in finding.sentence
+
+
+def test_only_the_recording_with_exchanged_columns_is_repaired(clean, held):
+    fit, out, _ = check([with_sent(clean, exchange)], [held], NOMINAL)
+    np.testing.assert_array_equal(fit[0].sent, clean.sent)
+    assert out[0] is held
