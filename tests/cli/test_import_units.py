@@ -20,6 +20,14 @@ def test_throttle_in_per_cent_has_the_scale_of_per_cent(carlab: Carlab, tmp_path
     assert "for example --throttle-scale 0.01." in text
 
 
+def test_throttle_somewhat_beyond_one_is_not_in_per_cent(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    data[:, 8] = 1.25 * np.sin(data[:, 0])
+    code, text = carlab("import", write(path, data))
+    assert code == 1
+    assert "say what full command is, for example --throttle-scale 0.8." in text
+
+
 def test_pulse_widths_need_a_neutral_one_and_a_scale(carlab: Carlab, tmp_path: Path) -> None:
     path, data = canonical_csv(tmp_path)
     steering = 0.8 * np.sin(data[:, 0])

@@ -327,7 +327,7 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
         if beyond.any():
             severity = Severity.ERROR if largest > MAX_COMMAND else Severity.WARNING
             full_command = max(largest / abs(mapping.columns[channel].scale), 1.0)  # the option replaces this scale
-            if channel == "throttle" and MAX_COMMAND < full_command <= 100.0:
+            if channel == "throttle" and 10.0 * MAX_COMMAND < full_command <= 100.0:
                 full_command = 100.0  # per cent
             option: str | None = f"--{channel}-scale {_rounded_down(1.0 / full_command)}"
             remedy = f"say what full command is, for example {option}"
