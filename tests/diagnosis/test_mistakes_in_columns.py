@@ -1,5 +1,7 @@
 """Mistakes of a log are faults of the recording and no physics: other sensors, late poses, exchanged columns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,3 +70,15 @@ def test_only_the_recording_with_exchanged_columns_is_repaired(clean, held):
     fit, out, _ = check([with_sent(clean, exchange)], [held], NOMINAL)
     np.testing.assert_array_equal(fit[0].sent, clean.sent)
     assert out[0] is held
+
+
+def test_commands_between_rows_are_reported_as_lost(clean):
+    """A log at 10 Hz of a car with 30 commands per second."""
+    sent = clean.sent[::3]
+    states = clean.states[::3][: len(sent) + 1]
+    changed = {"states": states, "requested": sent, "sent": sent[: len(states) - 1]}
+    slow = replace(clean, times_s=clean.times_s[::3][: len(states)], rewards=np.full(len(sent), np.nan), **changed)
+    _, _, faults = check([slow], [], NOMINAL)
+    (action,) = [f.action for f in faults if f.id == "coarse_rows"]
+    assert "rows are 0.099 s apart" in action
+    assert "the recording lacks the commands between the rows" in action

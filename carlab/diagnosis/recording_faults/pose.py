@@ -21,6 +21,8 @@ CONTROL_PERIODS_S = (5e-4, 0.6)
 MAX_INTERPOLATION_S = 0.25
 """[s] Maximum interpolated gap: motion of 2 Hz at 10 m/s^2 deviates by 2 mm from a cubic."""
 MAX_HEADING_REPAIRS = 3
+MAX_ROW_PERIODS = 1.5
+"""Longest time from row to row, in control periods: beyond it, commands between the rows are lost."""
 MIN_OFFSET_RAD = math.radians(30.0)
 """[rad] A smaller constant offset of yaw is a parameter of the measurement."""
 
@@ -28,6 +30,7 @@ MIN_OFFSET_RAD = math.radians(30.0)
 def check_pose(repair: EpisodeRepair, control_period_s: float) -> None:
     """Check and repair stamps and pose: units, then repeated rows (they resemble jumps), outliers, gaps."""
     _check_time_unit(repair, control_period_s)
+    _check_row_period(repair, control_period_s)
     _check_frame(repair)
     _check_repeats(repair)
     _check_outliers(repair)
@@ -51,6 +54,18 @@ def _check_time_unit(repair: EpisodeRepair, control_period_s: float) -> None:
     repair.cut_at_jumps()
     fault = Fault("wrong_unit", "t", f"a period of {period:.3g} s is implausible")
     repair.repaired(fault, f"the stamps are in {unit} and were converted")
+
+
+def _check_row_period(repair: EpisodeRepair, control_period_s: float) -> None:
+    """Report rows that are further apart than the commands of the car file."""
+    if repair.period_s <= MAX_ROW_PERIODS * control_period_s:
+        return
+    action = (
+        f"reported: rows are {repair.period_s:.3g} s apart, and the control period of the car file is "
+        f"{control_period_s:.3g} s: the recording lacks the commands between the rows. Record a row for each command, "
+        "or correct control_period."
+    )
+    repair.report("coarse_rows", "steering, throttle", len(repair.times_s), action)
 
 
 def _check_frame(repair: EpisodeRepair) -> None:
