@@ -94,6 +94,21 @@ def test_initial_states_are_more_accurate_without_curvature_bias(plain: Drive) -
     assert np.allclose(noise[[0, 1, 3, 4]] / after[[0, 1, 3, 4]], 1.0, atol=0.25)
 
 
+@pytest.mark.parametrize("periods", [-1.0, 1.0, 2.0])
+def test_wrong_command_delay_hardly_changes_the_initial_states(plain: Drive, periods: float) -> None:
+    """Another delay explains the measured differences better than that of the car file."""
+    delay_s = plain.nominal.command_delay_s + periods * plain.nominal.control_period_s
+    wrong = plain.nominal.with_values({"timing.command_delay": delay_s})
+    windows = cut_windows(plain.segments, 0.8, 0.3)
+    truth = plain.clean_at(windows)
+    uncorrected, expected, found = (
+        np.sqrt(np.mean((w.initial_states - truth) ** 2, axis=0))
+        for w in (windows, without_curvature_bias(windows, plain.nominal), without_curvature_bias(windows, wrong))
+    )
+    turning = [2, 4, 5]
+    assert np.all(found[turning] < uncorrected[turning] - 0.7 * (uncorrected - expected)[turning])
+
+
 def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
     """Modified commands disagree with the recording, so they hardly change the initial states."""
     windows = cut_windows(plain.segments, 0.8, 0.3)
