@@ -8,7 +8,7 @@ poses is regressed on the simulated difference.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,10 +24,10 @@ from sim_backends.measurement import COMMAND_DELAY, filters_velocities
 _GROUPS = (((0, 1),), ((2,), (4,), (5,)), ((3,),))
 """Channels with a common delay: position, turning (by the steering), speed (by the throttle). Within a group, tuples of
 channels with a common share of the bias."""
-OTHER_DELAYS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
-"""Changes of the command delay with which the bias is simulated, too [control periods]."""
-MIN_POWER_RISE = 0.1
-"""Another delay is used for a group of channels if it explains more of the measured differences by this share."""
+DELAY_CHANGES_PERIODS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+"""Changes of the command delay [periods of the recording] with which the bias is simulated in addition."""
+MIN_RISE_OF_EXPLAINED_SHARE = 0.1
+"""A changed delay is used for a group of channels if it explains more of the measured differences by this share."""
 
 
 def as_recorded(windows: PredictionWindows) -> PredictionWindows:
@@ -51,19 +51,33 @@ def without_curvature_bias(windows: PredictionWindows, config: SimulatorConfig) 
     if windows.steps < half or windows.past_commands.shape[1] <= half:
         return windows
     config = replace(config, effects={n: v for n, v in config.effects.items() if not filters_velocities(n)})
-    around = _around_the_start(windows, half)
+    delays_s = _command_delays_s(config, windows.period_s)
+    simulated = simulate_windows(_around_the_start(windows, half), config, {COMMAND_DELAY: delays_s})
+    by_delay = [_bias_and_difference(poses, windows, width) for poses in simulated]
+    evidence = [_evidence(difference, windows.curvature_bias) for _, difference in by_delay]
     initial_states, remaining = windows.initial_states.copy(), windows.curvature_bias.copy()
-    explained = dict.fromkeys(_GROUPS, -1.0)
-    for delayed in _with_other_delays(config, windows.period_s):
-        bias, difference = _bias_and_difference(simulate_windows(around, delayed)[0], windows, width)
-        share, power = _evidence(difference, windows.curvature_bias)
-        for group in _GROUPS:
-            columns = [channel for channels in group for channel in channels]
-            if (found := float(power[columns].sum())) > (1.0 + MIN_POWER_RISE) * explained[group]:
-                explained[group] = found
-                initial_states[:, columns] = (windows.initial_states - share * bias)[:, columns]
-                remaining[:, columns] = (windows.curvature_bias - share * difference)[:, columns]
+    for group in _GROUPS:
+        columns = [channel for channels in group for channel in channels]
+        delay = _best_delay([float(explained[columns].sum()) for _, explained in evidence])
+        (bias, difference), (share, _) = by_delay[delay], evidence[delay]
+        initial_states[:, columns] -= (share * bias)[:, columns]
+        remaining[:, columns] -= (share * difference)[:, columns]
     return replace(windows, initial_states=initial_states, curvature_bias=remaining)
+
+
+def _command_delays_s(config: SimulatorConfig, period_s: float) -> FloatArray:
+    """Command delay of the simulator [s], then the changed ones with which no command acts before it is sent.
+
+    They may lie outside the range of the car file, because they only serve the initial states.
+    """
+    changes_s = np.array([0.0, *DELAY_CHANGES_PERIODS]) * period_s
+    return config.command_delay_s + changes_s[min(config.delays_s()) + changes_s >= 0.0]
+
+
+def _best_delay(explained: Sequence[float]) -> int:
+    """Index of the delay that explains most; 0, that of the simulator, unless another one explains clearly more."""
+    best = int(np.argmax(explained))
+    return best if explained[best] > (1.0 + MIN_RISE_OF_EXPLAINED_SHARE) * explained[0] else 0
 
 
 def _evidence(simulated: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -73,24 +87,15 @@ def _evidence(simulated: FloatArray, measured: FloatArray) -> tuple[FloatArray, 
         The share (6,) of the simulated difference that the measured one contains, in [0, 1], and the share (6,) of the
         measured squares that it explains. Both are common to x and y.
     """
-    share, power = np.zeros(6), np.zeros(6)
+    share, explained = np.zeros(6), np.zeros(6)
     for channels in (channels for group in _GROUPS for channels in group):
         one, other = simulated[:, channels], measured[:, channels]
         common, simulated_squares = float(np.sum(one * other)), max(float(np.sum(one**2)), 1e-30)
         found = min(max(common / simulated_squares, 0.0), 1.0)
         share[list(channels)] = found
-        explained = found * (2.0 * common - found * simulated_squares)
-        power[list(channels)] = explained / max(float(np.sum(other**2)), 1e-30) / len(channels)
-    return share, power
-
-
-def _with_other_delays(config: SimulatorConfig, period_s: float) -> Iterator[SimulatorConfig]:
-    """The simulator, then the same with other command delays."""
-    yield config
-    for periods in OTHER_DELAYS:
-        delay_s = config.command_delay_s + periods * period_s
-        if min(config.delays_s()) + periods * period_s >= 0.0:
-            yield config.with_values({COMMAND_DELAY: delay_s})
+        squares = found * (2.0 * common - found * simulated_squares)
+        explained[list(channels)] = squares / max(float(np.sum(other**2)), 1e-30) / len(channels)
+    return share, explained
 
 
 def _bias_and_difference(

@@ -21,6 +21,7 @@ from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
 from carlab.diagnosis.unexplained.vibration import find_vibration
+from carlab.prediction import initial_states
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of
@@ -107,6 +108,34 @@ def test_wrong_command_delay_hardly_changes_the_initial_states(plain: Drive, per
     )
     turning = [2, 4, 5]
     assert np.all(found[turning] < uncorrected[turning] - 0.7 * (uncorrected - expected)[turning])
+
+
+def test_order_of_the_changed_delays_does_not_matter(plain: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The delay that explains most is used, not the first one that explains more than the simulator's."""
+    short = plain.nominal.with_values({"timing.command_delay": plain.nominal.command_delay_s - 0.03})
+    windows = cut_windows(plain.segments, 0.8, 0.3)
+    found = without_curvature_bias(windows, short).initial_states
+    reversed_changes = initial_states.DELAY_CHANGES_PERIODS[::-1]
+    monkeypatch.setattr(initial_states, "DELAY_CHANGES_PERIODS", reversed_changes)
+    np.testing.assert_allclose(without_curvature_bias(windows, short).initial_states, found, atol=1e-6)
+
+
+def test_range_of_the_command_delay_does_not_limit_the_initial_states(plain: Drive) -> None:
+    """The car file allows 60 to 100 ms. A delay outside of this range serves the initial states only."""
+    delay_s = plain.nominal.command_delay_s
+    ranged = replace(plain.nominal, priors={"timing.command_delay": (delay_s - 0.02, delay_s + 0.02)})
+    windows = cut_windows(plain.segments, 0.8, 0.3)
+    expected = without_curvature_bias(windows, plain.nominal).initial_states
+    np.testing.assert_array_equal(without_curvature_bias(windows, ranged).initial_states, expected)
+
+
+def test_delay_effect_of_the_car_file_counts_as_a_command_delay(plain: Drive) -> None:
+    """The command delay alone is shorter than its changes, and negative with them."""
+    delay_s = plain.nominal.command_delay_s
+    stated = plain.nominal.with_values({"timing.command_delay": 0.0, "effects.command_delay.extra_delay": delay_s})
+    windows = cut_windows(plain.segments, 0.8, 0.3)
+    expected = without_curvature_bias(windows, plain.nominal).initial_states
+    np.testing.assert_allclose(without_curvature_bias(windows, stated).initial_states, expected, atol=1e-6)
 
 
 def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
