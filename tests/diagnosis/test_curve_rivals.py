@@ -99,7 +99,7 @@ def test_forces_over_speed_replace_effects_that_turn_the_car_to_one_side() -> No
         names, rival, _ = rival_of(replace(CAR, effects={"wavy_moment": {"size": 0.15}}), SIDE_EFFECTS)
     assert names
     assert rival is not None
-    assert (rival.effect, rival.beside, rival.names) == ("side_force_over_speed", ("yaw_moment_over_speed",), ())
+    assert (rival.effect, rival.additional, rival.names) == ("side_force_over_speed", ("yaw_moment_over_speed",), ())
     formula = rival.formula()
     assert formula.startswith("side_force_over_speed: at -3 m/s ")
     assert "yaw_moment_over_speed: at -3 m/s " in formula

@@ -32,12 +32,12 @@ class RivalCurve:
     """A measured curve of one dimension, whose fit takes seconds.
 
     curve       id of the curve
-    beside      effects and further curves that are fitted with it
-    replaced    effects that it replaces, besides those that the curve represents
+    additional  effects and further curves that are fitted with it
+    replaced    effects that it replaces in addition to those with this curve in ``represented_by``
     """
 
     curve: str
-    beside: tuple[str, ...] = ()
+    additional: tuple[str, ...] = ()
     replaced: tuple[str, ...] = ()
 
     def replaces(self, effect: str) -> bool:
@@ -49,9 +49,9 @@ _TO_ONE_SIDE = (LateralBias.id, SteeringOffset.id, TorqueSteer.id, MocapYawMisal
 RIVAL_CURVES: dict[str, RivalCurve] = {
     rival.curve: rival
     for rival in (
-        RivalCurve(SteeringCurve.id, beside=(SteeringOffset.id,), replaced=(SteeringOffset.id,)),
+        RivalCurve(SteeringCurve.id, additional=(SteeringOffset.id,), replaced=(SteeringOffset.id,)),
         RivalCurve(ThrottleCurve.id),
-        RivalCurve(SideForceOverSpeed.id, beside=(YawMomentOverSpeed.id,), replaced=_TO_ONE_SIDE),
+        RivalCurve(SideForceOverSpeed.id, additional=(YawMomentOverSpeed.id,), replaced=_TO_ONE_SIDE),
     )
 }
 """By the id of the curve."""
@@ -67,7 +67,7 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         return None
     for curve, rival_curve in RIVAL_CURVES.items():
         replaced = tuple(n for n in found.effects if rival_curve.replaces(n))
-        if not replaced or not _is_free(problem, rival_curve) or control.stop():
+        if not replaced or not _is_available(problem, rival_curve) or control.stop():
             continue
         control.progress(f"measured curve in place of {', '.join(replaced)}", 0.96)
         rival = curve_in_addition(problem, found, curve, tuple(n for n in found.effects if n not in replaced))
@@ -79,9 +79,9 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
 def curve_in_addition(problem: SearchProblem, found: SearchResult, curve: str, names: tuple[str, ...]) -> RivalPhysics:
     """A curve and its effects, fitted together with ``names`` from the point of the accepted effects."""
     without = refit(problem, names, found.best, found.scale).fit
-    beside = RIVAL_CURVES[curve].beside
-    fit = refit(problem, (*names, *beside, curve), found.best, found.scale).fit
-    return RivalPhysics(curve, fit, without.cost - fit.cost, names, beside)
+    additional = RIVAL_CURVES[curve].additional
+    fit = refit(problem, (*names, *additional, curve), found.best, found.scale).fit
+    return RivalPhysics(curve, fit, without.cost - fit.cost, names, additional)
 
 
 def _limits(problem: SearchProblem, found: SearchResult, rival: RivalPhysics) -> Alternatives:
@@ -99,8 +99,8 @@ def _limits(problem: SearchProblem, found: SearchResult, rival: RivalPhysics) ->
     )
 
 
-def _is_free(problem: SearchProblem, rival: RivalCurve) -> bool:
-    """Whether the base model has the curve and its effects, and neither it nor a curve with it is in the car file."""
+def _is_available(problem: SearchProblem, rival: RivalCurve) -> bool:
+    """Whether the base model has the curve and its effects, and the car file no curve that contains it."""
     stated = problem.nominal.effects
     in_car_file = any(c in stated for c in (rival.curve, *EFFECTS[rival.curve].represented_by))
-    return not in_car_file and all(is_applicable(problem.nominal, e) for e in (rival.curve, *rival.beside))
+    return not in_car_file and all(is_applicable(problem.nominal, e) for e in (rival.curve, *rival.additional))

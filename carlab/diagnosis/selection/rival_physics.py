@@ -23,18 +23,18 @@ log = logging.getLogger(__name__)
 class RivalPhysics:
     """Significant uncatalogued physics.
 
-    effect   id of the uncatalogued effect
-    fit      fit with it and with ``names``
-    gain     fall of the cost with it
-    names    effects of the catalogue in the fit
-    beside   effects and curves that are a part of this physics
+    effect      id of the uncatalogued effect
+    fit         fit with it and with ``names``
+    gain        fall of the cost with it
+    names       effects of the catalogue in the fit
+    additional  further effects and curves that are a part of this physics
     """
 
     effect: str
     fit: Fit
     gain: float
     names: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
+    additional: tuple[str, ...] = ()
 
     def class_statement(self) -> str:
         """Class of the physics."""
@@ -42,7 +42,7 @@ class RivalPhysics:
 
     def formula(self) -> str:
         """Fitted parameters in one line."""
-        return "; ".join(_fitted_numbers(effect, self.fit) for effect in (self.effect, *self.beside))
+        return "; ".join(_fitted_numbers(effect, self.fit) for effect in (self.effect, *self.additional))
 
 
 def _fitted_numbers(effect: str, fit: Fit) -> str:
