@@ -53,6 +53,16 @@ def test_velocities_that_precede_late_poses_are_replaced(clean, rows):
     np.testing.assert_allclose(fit.states[5:-5, VX], clean.states[5:-rows, VX][:-5], atol=0.1)
 
 
+def test_velocities_less_than_half_a_row_early_are_no_fault(clean):
+    """A shift of a third of a row is within the error of stamps and filters."""
+    times_s = clean.times_s
+    early = [np.interp(times_s + 0.3 / 30.0, times_s, column) for column in clean.states[:, VX:].T]
+    shifted = with_states(clean, lambda states: states.__setitem__((slice(None), slice(VX, None)), np.stack(early, 1)))
+    (found,), _, faults = check([shifted], [], NOMINAL)
+    assert not faults
+    assert found is shifted
+
+
 def test_exchanged_command_columns_are_repaired(clean, held):
     fit, out, faults = check([with_sent(clean, exchange)], [with_sent(held, exchange)], NOMINAL)
     assert [(f.id, f.channel) for f in faults] == [("exchanged_columns", "steering, throttle")]
