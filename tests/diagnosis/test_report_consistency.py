@@ -178,7 +178,7 @@ def test_car_that_changed_before_the_held_out_recordings_is_not_missing_physics(
         "The refitted simulator agrees with the fitted recordings (0.8 noise floors) but not with the held-out ones "
         "(12.9 noise floors, 0.0258 m after 1 s)."
     )
-    assert "changed between them (carlab compare finds what), or" in sentence
+    assert "changed between them (carlab compare names the change), or" in sentence
     assert verdict_title(changed) == "The held-out recordings differ from the fitted ones"
     assert "carlab compare" in next_drive(changed)[1]
     assert curves_advice(changed) == ""

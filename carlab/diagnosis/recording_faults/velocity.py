@@ -31,7 +31,7 @@ from carlab.recording.pose_velocity import PoseMotion
 
 
 def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
-    """Check and repair vx, vy and yaw rate of recordings: frame, scale, spikes, backward differences.
+    """Check and repair vx, vy and yaw rate of recordings: frame, scale, spikes, early and late columns.
 
     Args:
         repairs: the recordings.
@@ -73,10 +73,10 @@ def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
     """Frame of the velocities, then scale and spikes of each column."""
     _check_frame(repair, motion)
     rotated = rotated_velocity(repair.states[:, 3:5].T, motion)
-    if rotated is not None:  # Which of yaw and velocities is right, the diagnosis finds by mocap_yaw_misalignment.
+    if rotated is not None:  # If the yaw is wrong, the diagnosis finds it as mocap_yaw_misalignment.
         vx, vy = repair.states[:, 3:5].T.copy()
         repair.states[:, 3], repair.states[:, 4] = to_world(vx, vy, np.asarray(rotated.evidence["offset_rad"]))
-        repair.repaired(rotated, "vx and vy were rotated by that angle")
+        repair.repaired(rotated, "vx and vy were rotated back by that angle")
     for channel in VELOCITY_CHANNELS:
         _check_scale(repair, motion, channel)
     for channel in VELOCITY_CHANNELS:

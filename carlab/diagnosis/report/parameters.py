@@ -18,7 +18,7 @@ def late_commands(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
     if not any(e is not None and e.at_limit and e.value < 0.0 for e in reducing):
         return ""
     return (
-        " No delay is left: the log may have the commands later than they act. Correct it with carlab import "
+        " The delay adds up to 0 s: the log may have the commands later than they act. Correct it with carlab import "
         "--command-lag."
     )
 

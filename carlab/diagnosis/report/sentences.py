@@ -378,7 +378,7 @@ def _different_when_held_out(diagnosis: Diagnosis) -> str:
         f"The refitted simulator agrees with the fitted recordings ({number(diagnosis.fitted_score)} noise floors) but "
         f"not with the held-out ones ({number(held.score)} noise floors, {with_unit(held.position_m, 'm')} after "
         f"{with_unit(diagnosis.horizon_s, 's')}). The car or the motion capture changed between them (carlab compare "
-        "finds what), or the held-out recordings have conditions that the fitted ones lack."
+        "names the change), or the held-out recordings have conditions that the fitted ones lack."
     )
 
 

@@ -298,11 +298,11 @@ def _check_commands(
 ) -> list[Finding]:
     """Clock, sign and delay of both commands by their effect on the motion."""
     findings = []
-    offset = clock_offset(grid, t_s - mapping.command_lag_s, list(sent.values()))
+    executed_s = t_s - mapping.command_lag_s
+    offset = clock_offset(grid, executed_s, list(sent.values()))
     if offset is not None:  # with another clock, sign and delay mean nothing
         return [_clock_finding(offset, t_s, mapping)]
-    lagged_s = t_s - mapping.command_lag_s
-    exchanged = exchanged_commands(grid, lagged_s, list(sent.values()), list(responses.values()))
+    exchanged = exchanged_commands(grid, executed_s, list(sent.values()), list(responses.values()))
     if exchanged is not None:  # the columns of the file, before sign and delay
         names = " and ".join(f"'{mapping.columns[channel].name}'" for channel in COMMAND_CHANNELS)
         return [Finding.of_fault(exchanged, remedy=f"exchange the columns {names} in the mapping")]

@@ -101,7 +101,7 @@ def _clockwise(mean: complex, declared: float, evidence: Mapping[str, float]) ->
 
 
 def _near_right_angle(offset: float) -> float:
-    """The multiple of a right angle [rad] nearest to ``offset``, if a misplaced rigid body can make the difference."""
+    """``offset``, or the nearest multiple of a right angle [rad] if a misplaced rigid body explains the difference."""
     right_angle = np.pi / 2 * round(offset / (np.pi / 2))
     return float(right_angle) if abs(offset - right_angle) <= LIMITS.heading_offset_rad else offset
 

@@ -201,8 +201,9 @@ def velocity_lag(channel: str, period_s: float, fit: ColumnFit) -> Fault | None:
 def early_velocities(t_s: FloatArray, states: FloatArray, motion: PoseMotion) -> Fault | None:
     """Velocities in ``states`` (N, 6) that precede the motion of its poses by half a row or more.
 
-    A filter makes velocities late, not early. So the poses have another delay than the velocities, for example a
-    gyroscope beside motion capture with latency. vx and yaw rate must agree, because vy is often noise.
+    A filter makes velocities late, not early. So the poses have a longer delay than the velocities, for example if a
+    gyroscope measures the yaw rate and motion capture has a latency. Both vx and yaw rate must precede the motion; vy
+    is often noise and does not count.
     """
     period_s = float(np.median(np.diff(t_s)))
     references = velocity_references(motion)
