@@ -48,18 +48,20 @@ class RivalPhysics:
 def _fitted_numbers(effect: str, fit: Fit) -> str:
     """Fitted parameters of an effect, or the deviations of a curve at its knots."""
     info, values = EFFECTS[effect], fit.values()
-    labels = [p.name for p in info.parameters]
-    if isinstance(info, MeasuredCurve):
-        places = free_knots(info.axes)
-        labels = [
-            "at " + ", ".join(f"{axis.knots[k]:g} {axis.unit}" for axis, k in zip(info.axes, place, strict=True))
-            for place in places
-        ]
+    labels = _knot_labels(info) if isinstance(info, MeasuredCurve) else [p.name for p in info.parameters]
     numbers = (
         f"{label} {values[f'effects.{effect}.{p.name}']:.3g} {p.unit}".strip()
         for label, p in zip(labels, info.parameters, strict=True)
     )
     return f"{effect}: " + ", ".join(numbers)
+
+
+def _knot_labels(curve: MeasuredCurve) -> list[str]:
+    """Coordinates of each free knot with their units."""
+    return [
+        "at " + ", ".join(f"{axis.knots[k]:g} {axis.unit}" for axis, k in zip(curve.axes, knot, strict=True))
+        for knot in free_knots(curve.axes)
+    ]
 
 
 def replacing_physics(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
