@@ -111,7 +111,7 @@ class Form:
 
     ``sized`` turns a size (0: identity, growing with the effect) into parameters; in the catalogue form these are the
     catalogue's. ``attach`` puts the effect into a world; a form that ``changes_car`` is attached before the others,
-    because they read its dimensions. ``typical`` and ``largest`` are sizes: where the search for a
+    because those read the dimensions of the car. ``typical`` and ``largest`` are sizes: where the search for a
     strength begins, and beyond which nothing is sensible; below ``smallest`` the equations are too stiff to integrate.
     """
 
