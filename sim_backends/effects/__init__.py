@@ -28,7 +28,14 @@ from sim_backends.effects.base import (
 )
 from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDamping
 from sim_backends.effects.combined_slip import CombinedSlip
-from sim_backends.effects.curves import CURVES, MeasuredCurve
+from sim_backends.effects.curves import (
+    DriveMap,
+    FrontTyreMap,
+    MeasuredCurve,
+    RearTyreMap,
+    SteeringCurve,
+    ThrottleCurve,
+)
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
 from sim_backends.effects.disturbances import BODY_FORCE_PARAMETERS, DISTURBANCES, DRIFTING_PARAMETERS, Disturbance
 from sim_backends.effects.drive import (
@@ -40,6 +47,7 @@ from sim_backends.effects.drive import (
     SpeedController,
     TractionLimit,
 )
+from sim_backends.effects.forces_over_speed import SideForceOverSpeed, YawMomentOverSpeed
 from sim_backends.effects.geometry import CentreOfMass, Wheelbase
 from sim_backends.effects.lags import MotorLag, SteeringLag
 from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
@@ -114,6 +122,15 @@ _ALL: tuple[Effect, ...] = (
 )
 CATALOGUE: dict[str, Effect] = {effect.id: effect for effect in _ALL}
 """The effects that a diagnosis names, by id, in the order of the catalogue."""
+CURVES: tuple[MeasuredCurve, ...] = (
+    DriveMap(),
+    ThrottleCurve(),
+    SteeringCurve(),
+    FrontTyreMap(),
+    RearTyreMap(),
+    SideForceOverSpeed(),
+    YawMomentOverSpeed(),
+)
 EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in (*UNCATALOGUED, *CURVES, *DISTURBANCES)}}
 """All effects: the catalogue, then uncatalogued physics, measured curves and disturbances. ``register`` adds to
 both."""

@@ -146,7 +146,7 @@ def test_every_form_of_one_cause_has_a_truth():
     assert {form.id for name, forms in FORMS.items() for form in forms if "_tyre_map" not in name} <= set(TRUTHS)
     assert {form.id for form in TYRE_FORMS} <= set(TRUTHS)
     assert {curve_id for curve_id, *_ in TRUTHS.values()} == set(FORMS)
-    assert set(FORMS) == {curve.id for curve in CURVES if not curve.represented_by}
+    assert set(FORMS) == {curve.id for curve in CURVES if curve.in_fits_of_curves}
 
 
 @pytest.mark.parametrize("form_id", TRUTHS)

@@ -39,8 +39,10 @@ def fit_curves(
     Returns:
         The fit with the accepted curves, or None without any, and the rejected curves.
     """
-    wanted = (c for c in CURVES if c.in_fits_of_curves and not c.represented_by)
-    curves = tuple(c.id for c in wanted if is_applicable(problem.nominal, c.id) and c.id not in problem.nominal.effects)
+    stated = problem.nominal.effects
+    curves = tuple(
+        c.id for c in CURVES if c.in_fits_of_curves and is_applicable(problem.nominal, c.id) and c.id not in stated
+    )
     effects = _effects_with(problem, found, curves)
     settings = problem.settings.curves
     few = replace(problem, windows=problem.windows.thinned(settings.max_windows))

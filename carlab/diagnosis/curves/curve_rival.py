@@ -20,7 +20,8 @@ from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.rival_physics import RivalPhysics
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.body import LateralBias, TorqueSteer
-from sim_backends.effects.curves import SideForceOverSpeed, SteeringCurve, ThrottleCurve, YawMomentOverSpeed
+from sim_backends.effects.curves import SteeringCurve, ThrottleCurve
+from sim_backends.effects.forces_over_speed import SideForceOverSpeed, YawMomentOverSpeed
 from sim_backends.effects.observations import MocapYawMisalignment
 from sim_backends.effects.steering import SteeringOffset
 
