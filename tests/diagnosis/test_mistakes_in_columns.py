@@ -41,6 +41,13 @@ def test_velocities_of_wheel_odometry_are_replaced_by_those_of_the_pose():
     np.testing.assert_allclose(fit.states[:, VY], true.states[:, VY], atol=0.12)
 
 
+def test_velocities_of_zero_are_one_fault_for_each_column(clean):
+    """A column without motion has no delay, so the poses are not late."""
+    empty = with_states(clean, lambda states: states.__setitem__((slice(None), slice(VX, None)), 0.0))
+    _, _, faults = check([empty], [], NOMINAL)
+    assert [(f.id, f.channel) for f in faults] == [("column_scale", "vx"), ("column_scale", "yaw_rate")]
+
+
 @pytest.mark.parametrize("rows", [1, 2])
 def test_velocities_that_precede_late_poses_are_replaced(clean, rows):
     """One delay of motion capture explains poses and velocities only if both have it."""

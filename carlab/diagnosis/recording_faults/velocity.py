@@ -60,7 +60,11 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
 
 def _replace_early(repairs: Sequence[EpisodeRepair], motions: Mapping[int, PoseMotion], *, alike: bool) -> None:
     """Estimate velocities from the pose where the columns precede it; ``alike`` as for ``check_velocities``."""
-    found = {k: early_velocities(repairs[k].times_s, repairs[k].states, motion) for k, motion in motions.items()}
+    found = {
+        k: early_velocities(repairs[k].times_s, repairs[k].states, motion)
+        for k, motion in motions.items()
+        if repairs[k].has_velocity_columns
+    }
     early = {k: fault for k, fault in found.items() if fault is not None}
     if alike and len(early) < len(repairs):
         return
