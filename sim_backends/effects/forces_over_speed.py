@@ -21,7 +21,7 @@ class _OverSpeed(MeasuredCurve, DynamicsEffect):
     class_statement = "a side force and a yaw moment that depend on the speed alone"
 
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """Vx [m/s]."""
+        """The speed vx [m/s]."""
         return (forces.vx,)
 
     def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
