@@ -170,4 +170,4 @@ def test_functions_have_at_most_60_lines() -> None:
         and node.end_lineno is not None
         and node.end_lineno - node.lineno >= 60
     }
-    assert long == {"tests/sim_backends/test_effects_dynamics.py: reference_rates"}
+    assert long == {"tests/helpers/reference_dynamics.py: reference_rates"}

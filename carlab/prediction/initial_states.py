@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from scipy.signal import savgol_coeffs
@@ -57,7 +58,7 @@ def without_curvature_bias(windows: PredictionWindows, config: SimulatorConfig) 
     evidence = [_evidence(difference, windows.curvature_bias) for _, difference in by_delay]
     initial_states, remaining = windows.initial_states.copy(), windows.curvature_bias.copy()
     for group in _GROUPS:
-        columns = [channel for channels in group for channel in channels]
+        columns = list(chain.from_iterable(group))
         delay = _best_delay([float(explained[columns].sum()) for _, explained in evidence])
         (bias, difference), (share, _) = by_delay[delay], evidence[delay]
         initial_states[:, columns] -= (share * bias)[:, columns]
@@ -88,7 +89,7 @@ def _evidence(simulated: FloatArray, measured: FloatArray) -> tuple[FloatArray, 
         measured squares that it explains. Both are common to x and y.
     """
     share, explained = np.zeros(6), np.zeros(6)
-    for channels in (channels for group in _GROUPS for channels in group):
+    for channels in chain.from_iterable(_GROUPS):
         one, other = simulated[:, channels], measured[:, channels]
         common, simulated_squares = float(np.sum(one * other)), max(float(np.sum(one**2)), 1e-30)
         found = min(max(common / simulated_squares, 0.0), 1.0)

@@ -20,7 +20,7 @@ class Wheelbase(DynamicsEffect):
     id = "wheelbase"
     order = 5
     base_models = ("dynamic", "linear_tyre", "blend")
-    """The kinematic car turns by ``tan(d) / L``: the wheelbase and the largest steering angle do nearly the same."""
+    """Not identifiable on the kinematic car: its curvature ``tan(d) / L`` depends on both the steering angle and L."""
     name = "a wheelbase that differs from the car file"
     summary = (
         "The wheelbase differs from the car file, or motion capture measures all distances too large or too small."

@@ -97,7 +97,7 @@ def test_initial_states_are_more_accurate_without_curvature_bias(plain: Drive) -
 
 @pytest.mark.parametrize("periods", [-1.0, 1.0, 2.0])
 def test_wrong_command_delay_hardly_changes_the_initial_states(plain: Drive, periods: float) -> None:
-    """Another delay explains the measured differences better than that of the car file."""
+    """The correction uses the delay that the recording shows, not that of the car file."""
     delay_s = plain.nominal.command_delay_s + periods * plain.nominal.control_period_s
     wrong = plain.nominal.with_values({"timing.command_delay": delay_s})
     windows = cut_windows(plain.segments, 0.8, 0.3)

@@ -86,7 +86,8 @@ class Scene:
         windows: list[Windows] = []
         for part, length_s in enumerate(self.lengths_s):
             world = World(self.car)
-            for c in sorted(concealed, key=lambda c: not c.form.changes_car):
+            changes_car_first = sorted(concealed, key=lambda c: not c.form.changes_car)
+            for c in changes_car_first:
                 c.form.attach(world, c.parameters)
             human = self.human(part)
             what = drive(world, human, length_s, start=human.start())

@@ -2,8 +2,8 @@
 
 A map of a command contains the named effects of this command as special cases, so it fits about as well if one of them
 is the physics. A side force and a yaw moment over the speed do not contain all effects that turn the car to one side;
-if one of these is the physics, they fit about as well or worse. If a curve predicts left-out blocks significantly
-better, by a relevant share of its own gain over the refit, the named effects are not the physics: the residual is then
+if one of these is the physics, they fit about as well or worse. The curve replaces the named effects if it lowers the
+error on left-out blocks significantly, by a relevant share of its own gain over the refit. The residual is then
 described by the class of the curve. The initial states of the windows are free, because their errors hide most of the
 difference (``identification.free_initial_states``).
 """
