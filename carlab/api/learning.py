@@ -142,8 +142,8 @@ def learn(
             authors' code; ``sim-fsvgd-corrected``: without its errors; ``fsvgd``: the paper's, without a simulator.
         particles: ``network`` (the default), or ``simulator``: networks that correct the steps of the prior simulator.
         history: number of past commands that model and policy observe. By default it covers the command delay, the
-            latency of motion capture and the window of the velocity estimate (4 for the simulated car; the paper's
-            methods have 3). After three episodes a message states the number that the recordings support.
+            latency of motion capture and the velocity window (4 for the simulated car; the paper's methods have 3).
+            After three episodes a message states the number that the recordings support.
         model_steps: optimiser steps of the model before an episode: 2500; of the paper's methods at most 40 000.
         updates: gradient steps of SAC before an episode, 30 000 by default. Before the first episode the number is 1.5
             times as large; after the third it is multiplied by 3 / episode.

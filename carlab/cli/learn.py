@@ -70,11 +70,12 @@ class Learn:
     ticks: int | None = ARGUMENT_DEFAULT
 
     prior: str | None = ARGUMENT_DEFAULT
-    """The prior simulator: nominal (the default: the car file), kinematic (the car file without wheel slip), auto, or
+    """The prior simulator: nominal (the default: the car file), kinematic (the car file without tyre slip), auto, or
     FILE.toml (for example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and
     parameters that the recordings support are added to the prior, and those that they contradict are removed; the run
-    prints each change. Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle
-    lie within 30 % of their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
+    prints each change. Parameters lie in the ranges of the file. If the file states any range or standard deviation,
+    its other numbers are exact; if it states none, drive gain, damping, maximum steering angle, yaw inertia and B and
+    mu of the tyres lie within 30 % of their values. With kinematic, only the first three of these are uncertain."""
 
     method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = ARGUMENT_DEFAULT
     particles: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Particles)) + "}")] = ARGUMENT_DEFAULT

@@ -1,7 +1,7 @@
 """Value of a better simulator as a prior: held-out likelihood against the number of rows, by prior.
 
 Four priors with the same rows, seeds, discrepancy, particles and measurement points: none (a zero mean), kinematic (the
-car file without wheel slip), nominal (the car file), and the diagnosed simulator with its effects. All simulators have
+car file without tyre slip), nominal (the car file), and the diagnosed simulator with its effects. All simulators have
 the same velocity delay, estimated from the rows, and the same time for the evaluation of time-dependent effects.
 """
 

@@ -70,10 +70,10 @@ KINEMATIC_PARAMETERS = ("motor.drive_gain", "motor.damping", "steering.max_angle
 
 
 def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"]) -> SimulatorConfig:
-    """Make the simulator of the prior: the car file's (nominal), or a kinematic one (no wheel slip).
+    """Make the simulator of the prior: the car file's (nominal), or a kinematic one (no tyre slip).
 
-    Ranges are those of the car file. Without them, the ``UNCERTAIN_PARAMETERS`` have a range of ``PRIOR_HALF_WIDTH``
-    about their values.
+    Ranges are those of the car file. If the file has no range and no standard deviation, the ``UNCERTAIN_PARAMETERS``
+    have a range of ``PRIOR_HALF_WIDTH`` about their values.
     """
     values = car.values()
     if kind == "kinematic":
