@@ -1,4 +1,4 @@
-"""Backward elimination: remove effects whose removal does not increase the loss on left-out blocks."""
+"""Backward elimination: remove effects whose removal does not increase the loss on left-out blocks significantly."""
 
 from __future__ import annotations
 
