@@ -26,7 +26,7 @@ from carlab.experiment.episodes.hooks import RunHooks
 @dataclass
 @options_of(drive)
 class Drive:
-    """Drive episodes with a policy, a scripted manoeuvre or a gamepad on a car, and record them.
+    """Drive episodes with a policy, a scripted manoeuvre, a gamepad or the keyboard on a car, and record them.
 
     A new folder in --out receives an MCAP and a rerun recording of each episode and a summary picture. Press ^C once to
     end after the tick, twice to stop at once.

@@ -105,7 +105,7 @@ class Import:
     """Factor on steering, to bring it into [-1, 1]."""
 
     steering_neutral: float | None = None
-    """Content of the column for the command 0, for example 1500 for pulse widths in microseconds."""
+    """Value in the column at the command 0, for example 1500 for pulse widths in microseconds."""
 
     throttle_sign: Sign | None = None
     """-1 if positive throttle drives backwards."""
@@ -114,7 +114,7 @@ class Import:
     """Factor on throttle, to bring it into [-1, 1]."""
 
     throttle_neutral: float | None = None
-    """Content of the column for the command 0."""
+    """Value in the column at the command 0."""
 
     yaw_offset_rad: Annotated[float | None, arg(name="yaw-offset")] = None
     swap_xy: bool | None = None

@@ -34,9 +34,10 @@ class Replay:
 
     On a simulated car: predict --horizon seconds ahead from many initial states along the recording, and print the
     errors of the simulator and of constant velocity. The errors are computed as in carlab diagnose, for the whole
-    recording and for its last part, which a diagnosis of this recording alone holds out. On any other car, or with
-    option --drive: put the car at the recorded start, send the recorded actions at their times, record the drive, and
-    print its difference from the recording.
+    recording and for its last part, which a diagnosis of this recording alone holds out. On a real or
+    emulated car, or with option --drive: put the car at the recorded start, send the recorded actions at their times
+    (a real car moves), record the drive, and print its difference from the recording. For predictions with the car file
+    of a real car, use --car sim --vehicle FILE.
     """
 
     recording: Positional[Path]

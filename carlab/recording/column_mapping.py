@@ -63,7 +63,7 @@ class ColumnSource:
     scale: float = 1.0
     """Any further factor, for example 0.04 for steering in [-25, 25]."""
     neutral: float = 0.0
-    """Content of the column for the command 0, for example 1500 for pulse widths in microseconds."""
+    """Value in the column at the command 0, for example 1500 for pulse widths in microseconds."""
 
     def values(self, channel: str, column: FloatArray) -> FloatArray:
         """The channel in SI units (N,) from its column (N,)."""
@@ -118,7 +118,7 @@ class ColumnMapping:
     """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
     clock: Literal["column", "velocity", "even"] = "column"
     """``column``: times of the time column. ``velocity``: each period from distance over speed, for a time column that
-    was constructed afterwards. ``even``: a uniform clock, for frames of constant rate with times of arrival."""
+    was constructed afterwards. ``even``: equal periods, for frames of constant rate with times of arrival."""
     command_lag_s: float = 0.0
     """Known delay of the command columns behind the moment at which the commands were sent [s]."""
     rate_hz: float | None = None

@@ -44,8 +44,8 @@ class CombinedSlip(DynamicsEffect):
     name = "driven wheels that spin and lock, with less side force"
     summary = "Driven wheels spin or lock: their tyres transmit limited force, and lose side force while they slip."
     sentence = (
-        "the driven wheels spin and lock: along the car their tyres transmit at most {grip_ratio} times their grip "
-        "across it, and they lose side force while they slip"
+        "the driven wheels spin and lock: the longitudinal force of their tyres is at most {grip_ratio} times their "
+        "lateral grip, and they lose side force while they slip"
     )
     refuted_if = "the wheels neither spin nor lock when full throttle is applied or released"
     order = 30

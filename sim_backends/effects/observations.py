@@ -23,7 +23,7 @@ class MarkerOffset(ObservationEffect):
         "motion capture tracks a point {ahead:size} {ahead:ahead of|behind} and {left:size} to the {left:left|right} "
         "of the centre of mass"
     )
-    refuted_if = "on a slow circle the tracked point has the side velocity of the centre of mass"
+    refuted_if = "on a slow circle the tracked point has the lateral velocity of the centre of mass"
     parameters = (
         EffectParameter("ahead", "m", 0.0, -1.0, 1.0, 0.03),
         EffectParameter("left", "m", 0.0, -1.0, 1.0, 0.01),
@@ -75,7 +75,7 @@ class MocapYawMisalignment(ObservationEffect):
     name = "a yaw misalignment of motion capture"
     summary = "The forward axis of the rigid body in motion capture differs from the forward axis of the car."
     sentence = "motion capture measures a heading {angle:size} to the {angle:left|right} of the true heading"
-    refuted_if = "driving straight with the steering centred, the measured side velocity does not grow with speed"
+    refuted_if = "driving straight with the steering centred, the measured lateral velocity does not grow with speed"
     order = 60
     parameters = (EffectParameter("angle", "rad", 0.0, -3.2, 3.2, 0.03),)
 

@@ -194,8 +194,8 @@ class SteeringOffset(ActuatorEffect):
             "mocap_yaw_misalignment",
             "throttle_ramp",
             (
-                "a steering offset curves the path; a yaw misalignment appears only as a side velocity proportional to "
-                "speed"
+                "a steering offset curves the path; a yaw misalignment appears only as a lateral velocity proportional "
+                "to speed"
             ),
         ),
     )

@@ -47,7 +47,10 @@ class TyreSaturation(DynamicsEffect):
     id = "tyre_saturation"
     name = "the limit of tyre grip"
     summary = "The tyres' side force saturates at large slip angles."
-    sentence = "the side force of the tyres saturates, at a friction of {mu_front} in front and {mu_rear} at the rear"
+    sentence = (
+        "the side force of the tyres saturates, with a friction coefficient of {mu_front} in front and {mu_rear} at "
+        "the rear"
+    )
     refuted_if = "even at walking pace, turns tighten less than in proportion to the command (then it is the steering)"
     parameters = (
         EffectParameter("mu_front", "1", None, 0.0, 5.0, 0.43, same_as="tyre.front.mu"),
@@ -184,11 +187,11 @@ class FrictionEllipse(DynamicsEffect):
 
     id = "friction_ellipse"
     represented_by = ("rear_tyre_map",)
-    name = "grip shared between driving and cornering"
+    name = "a friction ellipse of the driven tyres"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (
-        "driving and braking reduce the grip for cornering: a friction ellipse with {scale} times the drive "
-        "force {action:choice scales|limits} the side force of the rear tyres"
+        "driving and braking reduce the grip for cornering: a friction ellipse {action:choice scales|limits} the side "
+        "force of the rear tyres, with {scale} times the drive force"
     )
     refuted_if = (
         "driving and braking change the handling balance in opposite directions (then load moves between axles)"

@@ -44,7 +44,7 @@ class LongitudinalSlip(DynamicsEffect):
     id = "longitudinal_slip"
     represented_by = ("drive_map",)
     command = "throttle"
-    name = "slipping driven wheels"
+    name = "longitudinal slip of the driven wheels"
     summary = "The driven wheels slip: they accelerate before the car does, and transmit at most their grip."
     sentence = "the driven wheels slip: their inertia is {inertia}, their longitudinal tyre stiffness {stiffness}"
     refuted_if = "the drive force is late by the same time at low and at high throttle (then the motor lags)"

@@ -85,7 +85,7 @@ class MarkerAhead(ObservationEffect):
     name = "a tracked point ahead of the centre of mass"
     summary = "Motion capture tracks a point on the car's axis that is not the centre of mass."
     sentence = "the tracked point is {ahead:size} {ahead:ahead of|behind} the centre of mass"
-    refuted_if = "on a slow circle the tracked point has the side velocity of the centre of mass"
+    refuted_if = "on a slow circle the tracked point has the lateral velocity of the centre of mass"
 
     def observe(self, ops, state, values):
         x, y, yaw, vx, vy, yaw_rate = state

@@ -57,7 +57,8 @@ def _likely_causes(check: QuickCheck, decide: str) -> str:
         return f"No single effect of the catalogue and no parameter of the car file explains it; {decide}."
     first, *others = check.causes
     text = (
-        f"Most likely cause: {_cause(first)}, which explains {percent(first.share)} of the excess on held-out windows"
+        f"Most likely cause: {_cause(first)}, which explains {percent(first.share)} of the excess loss on held-out "
+        "windows"
     )
     for cause in others:
         label = "indistinguishable from it" if cause.ties_with_first else "less likely"

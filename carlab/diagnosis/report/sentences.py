@@ -292,7 +292,7 @@ def _mismatch(diagnosis: Diagnosis) -> str:
         named = "corrected numbers" if effects and all(e.car_file_values for e in effects) else named
         text += f" With {named}, {fall}{known if math.isfinite(share) else ''}."
     if (rest := relevant_residual(diagnosis)) is not None:
-        return f"{text} Of this excess, {percent(rest.share)} stays unexplained."
+        return f"{text} Of this squared excess, {percent(rest.share)} stays unexplained."
     return f"{text}{_warning_above_noise(diagnosis, 'with_effects')}"
 
 

@@ -27,7 +27,7 @@ MIN_HISTORY, MAX_HISTORY = 3, 8
 LARGEST_GIVEN_HISTORY = 100
 """Largest number of past commands of a file; a user may ask for more than ``MAX_HISTORY``."""
 MIN_ENTRY_SHARE = 0.3
-"""Minimum share of the error on held-out windows that a cause of the quick check explains."""
+"""Minimum share of the excess loss on held-out windows that a cause of the quick check explains."""
 MIN_STD_SHARE = 0.2
 """Minimum standard deviation of a number of the quick check, relative to its change: one cause is fitted alone."""
 
@@ -227,7 +227,7 @@ def _entry(found: Findings) -> Correction | None:
         if spread > 0.0 and not info.choices:
             std[name] = spread
     name = str(cause["id"]).removeprefix("effects.")
-    share = f"it explains {100.0 * cause['share']:.0f} % of the error on held-out windows"
+    share = f"it explains {100.0 * cause['share']:.0f} % of the excess loss on held-out windows"
     return Correction(name if name in EFFECTS else PARAMETERS, values, std, found.episodes, "quick check", share)
 
 

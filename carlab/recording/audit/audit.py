@@ -136,7 +136,7 @@ def _finding(fault: Fault, mapping: ColumnMapping) -> Finding:
         return Finding.of_fault(fault, Severity.INFO)
     if fault.id == "standing_pose":
         return Finding.of_fault(fault, Severity.WARNING, "check that x, y and yaw are those of the car")
-    alternative = " (or --x-unit m --y-unit m if it is so)" if fault.channel == "x, y" else ""
+    alternative = " (or --x-unit m --y-unit m if x and y are in metres)" if fault.channel == "x, y" else ""
     if fault.option == "--yaw-sign -1":
         alternative = f" (or {mapping.combined('--y-sign -1')})"
     if "offset_rad" in fault.evidence:  # the option replaces the offset of the mapping
@@ -267,7 +267,7 @@ def _check_yaw_rate(
         findings.append(Finding.of_fault(fault, remedy=f"take those rows from the pose with {fault.option}"))
     if spikes.others.any():
         sentence = (
-            f"Column yaw_rate is far from the turn rate of yaw in {spikes.others.sum()} further rows (first row "
+            f"Column yaw_rate is far from the derivative of yaw in {spikes.others.sum()} further rows (first row "
             f"{np.argmax(spikes.others) + 1}): an impact, or a frame that came late."
         )
         findings.append(Finding.at(spikes.others, "outliers", "yaw_rate", Severity.INFO, sentence))
@@ -313,7 +313,7 @@ def _check_commands(
         evidence = {} if response is None else _command_evidence(channel, t_s, command, motion, response)
         if response is None or response.best < LIMITS.command_explained[index]:
             if np.ptp(command) > MIN_COMMAND_RANGE and is_long:
-                sentence = f"{channel.capitalize()} explains too little of {effect}: its sign is unknown."
+                sentence = f"{channel.capitalize()} explains too little of {effect}: the sign of {channel} is unknown."
                 findings.append(Finding("unclear_sign", channel, Severity.INFO, sentence, evidence=evidence))
         elif response.gain < 0 and response.lag_s > -LIMITS.early_response_s:
             findings.append(_sign_finding(wrong_command_sign(channel, response, evidence), mapping))
@@ -321,7 +321,8 @@ def _check_commands(
             delay_s = evidence["delay_s"]
             sentence = (
                 f"{effect[0].upper()}{effect[1:]} {'follows' if delay_s >= 0 else 'precedes'} {channel} by about "
-                f"{abs(delay_s):.2f} s ({response.best:.0%} explained), delay, servo or motor and tyres together."
+                f"{abs(delay_s):.2f} s ({channel} explains {response.best:.0%} of it): the sum of the delay and the "
+                f"lags of {'servo' if channel == 'steering' else 'motor'} and tyres."
             )
             findings.append(Finding("command_delay", channel, Severity.INFO, sentence, evidence=evidence))
     return findings
