@@ -47,7 +47,12 @@ from sim_backends.effects.drive import (
     SpeedController,
     TractionLimit,
 )
-from sim_backends.effects.forces_over_speed import SideForceOverSpeed, YawMomentOverSpeed
+from sim_backends.effects.force_curves import (
+    SideForceOverSlip,
+    SideForceOverSpeed,
+    YawMomentOverSlip,
+    YawMomentOverSpeed,
+)
 from sim_backends.effects.geometry import CentreOfMass, Wheelbase
 from sim_backends.effects.lags import MotorLag, SteeringLag
 from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
@@ -130,6 +135,8 @@ CURVES: tuple[MeasuredCurve, ...] = (
     RearTyreMap(),
     SideForceOverSpeed(),
     YawMomentOverSpeed(),
+    SideForceOverSlip(),
+    YawMomentOverSlip(),
 )
 EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in (*UNCATALOGUED, *CURVES, *DISTURBANCES)}}
 """All effects: the catalogue, then uncatalogued physics, measured curves and disturbances. ``register`` adds to

@@ -139,6 +139,8 @@ class Effect:
     """Observation that would refute the effect, a clause after "if"."""
     catalogued: ClassVar[bool] = True
     """Whether a diagnosis may name the effect; otherwise it is rival physics, described by ``class_statement``."""
+    is_general_rival: ClassVar[bool] = True
+    """Whether uncatalogued physics is a rival of all effects, and not of a few (``carlab.diagnosis.curves``)."""
     class_statement: ClassVar[str] = ""
     represented_by: ClassVar[tuple[str, ...]] = ()
     """Ids of measured curves that contain the effect; a fit of such a curve omits the effect."""

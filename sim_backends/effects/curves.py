@@ -55,6 +55,7 @@ class MeasuredCurve(Effect):
     bound: ClassVar[float]
     """Largest deviation."""
     catalogued: ClassVar[bool] = False
+    is_general_rival: ClassVar[bool] = False
     in_fits_of_curves: ClassVar[bool] = True
     """Whether ``--curves`` fits it; otherwise a diagnosis uses it only as a rival of named effects."""
 
@@ -339,6 +340,14 @@ _FORCE_NAME, _FORCE_UNIT = "longitudinal force per mass", "m/s2"
 _SLIP_AXIS = Axis("slip angle", "rad", (0.0, 0.04, 0.1, 0.2, 0.4, 0.8), anchor=0.0)
 
 
+def front_slip_rad(ops: Ops, forces: Forces) -> Value:
+    """Slip angle of the front wheels (cars,) [rad] in the base model, positive where the tyres push to the right."""
+    front = forces.vy + forces.front_axle * forces.yaw_rate
+    along = forces.vx * forces.wheel_cos + front * forces.wheel_sin
+    across = front * forces.wheel_cos - forces.vx * forces.wheel_sin
+    return ops.slope_angle(across, ops.at_least(ops.abs(along), SLIP_FLOOR_MPS))
+
+
 class FrontTyreMap(_SideForceMap):
     """``F_y,front -= F_z a(F_x / m, |slip|) sign(slip)`` in the front wheels' frame."""
 
@@ -351,10 +360,7 @@ class FrontTyreMap(_SideForceMap):
 
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
         """As in the base model."""
-        front = forces.vy + forces.front_axle * forces.yaw_rate
-        along = forces.vx * forces.wheel_cos + front * forces.wheel_sin
-        across = front * forces.wheel_cos - forces.vx * forces.wheel_sin
-        return ops.slope_angle(across, ops.at_least(ops.abs(along), SLIP_FLOOR_MPS))
+        return front_slip_rad(ops, forces)
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add the deviation to the side force of the front axle."""

@@ -15,6 +15,7 @@ class Disturbance(Effect):
     """Base of disturbances; all are 0 for a car like its simulator."""
 
     catalogued = False
+    is_general_rival = False
 
 
 class DriveChange(Disturbance, DynamicsEffect):

@@ -17,6 +17,7 @@ from sim_backends.effects.base import (
     DynamicsEffect,
     EffectParameter,
     Forces,
+    ObservationEffect,
     Parameters,
     ScreeningProbe,
 )
@@ -31,6 +32,8 @@ SCREENING_COEFFICIENT = 0.15
 """Drag coefficient at which a wind is screened [N s2/m2]."""
 COAST_THROTTLE = 0.05
 """Throttle below which a speed controller brakes."""
+HEADING_HARMONICS = 3
+"""Waves of a heading error over a turn of the car."""
 
 
 class Wind(DynamicsEffect):
@@ -163,4 +166,46 @@ class CoastBrake(DynamicsEffect):
         forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.exp(-share * share), forces.force_x)
 
 
-UNCATALOGUED = (Wind(), FrontSideForce(), RearSideForce(), LockedAxle(), BrakingPull(), CoastBrake())
+class HeadingError(ObservationEffect):
+    """``yaw_meas = yaw + e(yaw)`` with ``e = mean + sum_k (cos_k cos(k yaw) + sin_k sin(k yaw))``, k from 1 to 3.
+
+    The velocities are measured in the axes of the measured heading. The measured yaw rate is ``r (1 + de/dyaw)``.
+    """
+
+    id = "heading_error"
+    catalogued = False
+    is_general_rival = False
+    summary = "The measured heading has an error that depends on the heading."
+    class_statement = "an error of the measured heading that depends on the heading alone"
+    depends_on = frozenset({"heading"})
+    order = 61
+    parameters = (
+        EffectParameter("mean", "rad", 0.0, -0.5, 0.5, 0.02),
+        *(
+            EffectParameter(f"{wave}_{k}", "rad", 0.0, -0.2 / k, 0.2 / k, 0.01 / k)
+            for k in range(1, HEADING_HARMONICS + 1)
+            for wave in ("cos", "sin")
+        ),
+    )
+
+    def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """Turn the axes."""
+        x, y, yaw, vx, vy, yaw_rate = state
+        error, slope = values["mean"], 0.0 * yaw
+        for k in range(1, HEADING_HARMONICS + 1):
+            cos, sin = ops.cos(k * yaw), ops.sin(k * yaw)
+            error = error + values[f"cos_{k}"] * cos + values[f"sin_{k}"] * sin
+            slope = slope + k * (values[f"sin_{k}"] * cos - values[f"cos_{k}"] * sin)
+        sin, cos = ops.sin(error), ops.cos(error)
+        return x, y, yaw + error, vx * cos + vy * sin, vy * cos - vx * sin, yaw_rate * (1.0 + slope)
+
+
+UNCATALOGUED = (
+    Wind(),
+    FrontSideForce(),
+    RearSideForce(),
+    LockedAxle(),
+    BrakingPull(),
+    CoastBrake(),
+    HeadingError(),
+)

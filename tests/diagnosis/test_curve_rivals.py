@@ -1,4 +1,4 @@
-"""Measured curves as rivals of named effects, on drives of a car with a known throttle map or a known yaw moment."""
+"""Measured curves as rivals of named effects, on drives of a car with a known map, yaw moment or error of the heading."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,6 +22,7 @@ from sim_backends.effects import (
     EffectParameter,
     Forces,
     MeasuredCurve,
+    ObservationEffect,
     confusable_effects,
 )
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -67,6 +68,38 @@ class WavyMoment(DynamicsEffect):
         forces.moment = forces.moment + values["size"] * ops.sin(forces.vx * (0.5 * np.pi))
 
 
+class WavyForce(DynamicsEffect):
+    """``F_y += size cos(pi slip / 0.4 rad)``, slip being that of the front wheels."""
+
+    id = "wavy_force"
+    catalogued = False
+    summary = "A side force is a wave over the slip angle."
+    class_statement = "a wave"
+    parameters = (EffectParameter("size", "N", 0.0, -5.0, 5.0, 0.5),)
+
+    def on_body(self, ops: Ops, forces: Forces, values: Mapping[str, Value]) -> None:
+        slip = ops.atan((forces.vy + forces.front_axle * forces.yaw_rate) / ops.at_least(forces.vx, 0.3))
+        wave = ops.cos((slip - forces.wheel_angle) * (np.pi / 0.4))
+        forces.force_y = forces.force_y + values["size"] * wave
+
+
+class WavyHeading(ObservationEffect):
+    """``yaw_meas = yaw + size (1 + sin(2 yaw + 1))``, with velocities in the measured axes."""
+
+    id = "wavy_heading"
+    catalogued = False
+    summary = "The error of the heading is a wave over the heading."
+    class_statement = "a wave"
+    parameters = (EffectParameter("size", "rad", 0.0, -0.3, 0.3, 0.02),)
+
+    def observe(self, ops: Ops, state: tuple[Value, ...], values: Mapping[str, Value]) -> tuple[Value, ...]:
+        x, y, yaw, vx, vy, yaw_rate = state
+        error = values["size"] * (1.0 + ops.sin(2.0 * yaw + 1.0))
+        sin, cos = ops.sin(error), ops.cos(error)
+        rate = yaw_rate * (1.0 + 2.0 * values["size"] * ops.cos(2.0 * yaw + 1.0))
+        return x, y, yaw + error, cos * vx + sin * vy, cos * vy - sin * vx, rate
+
+
 def rival_of(
     true: SimulatorConfig, candidates: tuple[str, ...]
 ) -> tuple[tuple[str, ...], RivalPhysics | None, list[Decision]]:
@@ -110,6 +143,25 @@ def test_forces_over_speed_replace_effects_that_turn_the_car_to_one_side() -> No
     assert measured == pytest.approx(0.15 * np.sin(0.5 * np.pi * SPEEDS_MPS), abs=0.03)
 
 
+def test_forces_over_slip_replace_effects_that_turn_the_car_to_one_side() -> None:
+    with registered(WavyForce()):
+        names, rival, _ = rival_of(replace(CAR, effects={"wavy_force": {"size": 1.0}}), SIDE_EFFECTS)
+    assert names
+    assert rival is not None
+    assert (rival.effect, rival.additional, rival.names) == ("side_force_over_slip", ("yaw_moment_over_slip",), ())
+
+
+def test_error_over_the_heading_replaces_a_yaw_misalignment() -> None:
+    with registered(WavyHeading()):
+        names, rival, _ = rival_of(replace(CAR, effects={"wavy_heading": {"size": 0.03}}), ("mocap_yaw_misalignment",))
+    assert names == ("mocap_yaw_misalignment",)
+    assert rival is not None
+    assert (rival.effect, rival.names) == ("heading_error", ())
+    fitted = {name: rival.fit.values()[f"effects.heading_error.{name}"] for name in ("sin_2", "cos_2", "sin_1", "cos_1")}
+    true = {"sin_2": 0.03 * np.cos(1.0), "cos_2": 0.03 * np.sin(1.0), "sin_1": 0.0, "cos_1": 0.0}
+    assert fitted == pytest.approx(true, abs=0.003)
+
+
 @pytest.mark.parametrize(
     ("effect", "values", "candidates"),
     [
@@ -117,6 +169,8 @@ def test_forces_over_speed_replace_effects_that_turn_the_car_to_one_side() -> No
         ("throttle_asymmetry", {"gain_ratio": 0.6}, THROTTLE_EFFECTS),
         ("torque_steer", {"coefficient": 0.1}, SIDE_EFFECTS),
         ("lateral_bias", {"force": 1.0}, SIDE_EFFECTS),
+        ("steering_offset", {"angle": 0.03}, SIDE_EFFECTS),
+        ("mocap_yaw_misalignment", {"angle": 0.05}, SIDE_EFFECTS),
     ],
 )
 def test_curve_does_not_replace_a_true_effect(
@@ -125,4 +179,4 @@ def test_curve_does_not_replace_a_true_effect(
     names, rival, decisions = rival_of(replace(CAR, effects={effect: values}), candidates)
     assert names == (effect,)
     assert rival is None
-    assert [(d.effect, d.passed) for d in decisions] == [(effect, True)]
+    assert {(d.effect, d.passed) for d in decisions} == {(effect, True)}

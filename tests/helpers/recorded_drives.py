@@ -5,13 +5,18 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import Action, CarState, FloatArray
 from sim_backends import SimulatorConfig
+from sim_backends.array_ops import ARRAYS
+from sim_backends.measurement import MeasurementModel
 from sim_backends.plant import Plant
 
 PERIOD_S = 1.0 / 30.0
 
 
 def drive(config: SimulatorConfig, seconds: float, seed: int, noise: float = 3e-4) -> EpisodeData:
-    """Record a drive with commands that change every 0.3 to 1 s, and noise on poses and velocities."""
+    """Record a drive with commands that change every 0.3 to 1 s, and noise on poses and velocities.
+
+    Latency and filters of the measurement are not applied.
+    """
     rng = np.random.default_rng(seed)
     ticks = int(seconds / PERIOD_S)
     commands = np.zeros((ticks, 2))
@@ -20,7 +25,8 @@ def drive(config: SimulatorConfig, seconds: float, seed: int, noise: float = 3e-
         held = int(rng.uniform(9, 30))
         commands[row : row + held] = rng.uniform(-0.8, 0.8), rng.choice([-0.3, 0.0, 0.1, 0.3, 0.5, 0.8])
         row += held
-    states = driven(config, commands)
+    measurement = MeasurementModel(ARRAYS, config.values(), config.effects)
+    states = np.stack(measurement.observe(tuple(driven(config, commands).T)), axis=1)
     scale = noise * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
     measured = states + scale * rng.normal(size=states.shape)
     times_s = PERIOD_S * np.arange(ticks + 1)

@@ -16,6 +16,7 @@ START = (0.2, -0.1, 0.7, 1.8, 0.1, -0.4)
 THROTTLES = (-1, -0.6, -0.35, -0.2, -0.1, -0.04, 0, 0.04, 0.1, 0.2, 0.35, 0.6, 1)
 SPEEDS = (-4.5, -3, -2, -1, -0.5, 0, 0.5, 1, 2, 3, 4.5)
 FORCE_SPEEDS = (-3, -1.5, -0.5, 0, 0.5, 1, 1.5, 2, 2.5, 3, 4)
+FORCE_SLIPS = (-0.5, -0.3, -0.18, -0.1, -0.04, 0, 0.04, 0.1, 0.18, 0.3, 0.5)
 SLIPS = (0, 0.04, 0.1, 0.2, 0.4, 0.8)
 ACCELERATIONS = {"front_tyre_map": (-6, -3, 0, 3, 6), "rear_tyre_map": (-8, -5, -2.5, 0, 2.5, 5, 8)}
 
@@ -45,6 +46,11 @@ def over_speed(e, name, speed):
     """A curve over the speed by numpy's interpolation; its deviation is 0 at rest."""
     values = list(e[name].values())
     return float(np.interp(speed, FORCE_SPEEDS, [*values[:3], 0.0, *values[3:]]))
+
+
+def over_slip(e, name, slip, vx):
+    """A curve over the slip angle by numpy's interpolation, which fades at rest."""
+    return float(np.interp(slip, FORCE_SLIPS, list(e[name].values()))) * math.tanh(abs(vx) / 0.2)
 
 
 def spinning_rims(e, p, vx, vy, r, demand, grip):
@@ -144,6 +150,10 @@ def reference_rates(t, s, d, u, p, e):
 
     side = vy + a * r
     slip_front = math.atan2(side * math.cos(d) - vx * math.sin(d), max(abs(vx * math.cos(d) + side * math.sin(d)), 0.3))
+    if has("side_force_over_slip"):
+        body_y += m * over_slip(e, "side_force_over_slip", slip_front, vx)
+    if has("yaw_moment_over_slip"):
+        moment += m * over_slip(e, "yaw_moment_over_slip", slip_front, vx)
     if has("front_wheel_play"):
         slip_front -= np.clip(slip_front, -e["front_wheel_play"]["angle"], e["front_wheel_play"]["angle"])
     slip_rear = math.atan2(vy - b * r, max(abs(vx), 0.3))

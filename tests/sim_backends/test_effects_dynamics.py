@@ -29,6 +29,8 @@ def curve_values(name, size):
 CURVE_SIZES = {
     "side_force_over_speed": 1.0,
     "yaw_moment_over_speed": 1.0,
+    "side_force_over_slip": 1.0,
+    "yaw_moment_over_slip": 1.0,
     "drive_map": 1.0,
     "front_tyre_map": 0.3,
     "rear_tyre_map": 0.3,

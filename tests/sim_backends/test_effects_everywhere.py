@@ -1,5 +1,6 @@
 """Test properties of each effect: identity, engines, gradients, files, symmetries."""
 
+import cmath
 import functools
 import math
 import tomllib
@@ -281,6 +282,7 @@ MIRRORED = {
     "rear_side_force": ("force",),
     "braking_pull": ("coefficient",),
     "mocap_yaw_misalignment": ("angle",),
+    "heading_error": ("mean", "cos_1", "cos_2", "cos_3"),
     "steering_trim": ("angle",),
     "body_force": ("left", "moment"),
 }
@@ -294,7 +296,7 @@ def test_mirror_symmetry(name):
     other = {k: -v if k in MIRRORED.get(name, ()) else v for k, v in typical(name).items()}
     if name in ("side_force_over_speed", "yaw_moment_over_speed"):
         other = {k: -v for k, v in other.items()}
-    if name == "steering_curve":
+    if name in ("steering_curve", "side_force_over_slip", "yaw_moment_over_slip"):
         other = {k: -v for k, v in zip(other, reversed(other.values()), strict=True)}
     mirror = torch.tensor([-1.0, 1.0], dtype=torch.float64)
     image = measured_rollout(
@@ -326,6 +328,10 @@ def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
         )
     if name in ("road_slope", "wind"):
         moved_parameters["direction"] += angle
+    if name == "heading_error":
+        for k in (1, 2, 3):
+            wave = complex(numbers[f"cos_{k}"], numbers[f"sin_{k}"]) * cmath.exp(1j * k * angle)
+            moved_parameters[f"cos_{k}"], moved_parameters[f"sin_{k}"] = wave.real, wave.imag
     original = measured_rollout(SimulatorConfig(effects={name: numbers}), start, commands)
     image = measured_rollout(SimulatorConfig(effects={name: moved_parameters}), transformed(start), commands)
     assert torch.allclose(transformed(original.states), image.states, rtol=0, atol=1e-10)

@@ -1,8 +1,9 @@
 """Measured curves as rivals of named effects.
 
 A map of a command contains the named effects of this command as special cases, so it fits about as well if one of them
-is the physics. A side force and a yaw moment over the speed do not contain all effects that turn the car to one side;
-if one of these is the physics, they fit about as well or worse. The curve replaces the named effects if it lowers the
+is the physics; so does an error of the heading over the heading, which contains a yaw misalignment. A side force and a
+yaw moment over the speed or the slip angle do not contain all effects that turn the car to one side; if one of these is
+the physics, they fit about as well or worse. The curve replaces the named effects if it lowers the
 error on left-out blocks significantly, by a relevant share of its own gain over the refit. The residual is then
 described by the class of the curve. The initial states of the windows are free, because their errors hide most of the
 difference (``identification.free_initial_states``).
@@ -21,9 +22,15 @@ from carlab.diagnosis.selection.rival_physics import RivalPhysics
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.body import LateralBias, TorqueSteer
 from sim_backends.effects.curves import SteeringCurve, ThrottleCurve
-from sim_backends.effects.forces_over_speed import SideForceOverSpeed, YawMomentOverSpeed
+from sim_backends.effects.force_curves import (
+    SideForceOverSlip,
+    SideForceOverSpeed,
+    YawMomentOverSlip,
+    YawMomentOverSpeed,
+)
 from sim_backends.effects.observations import MocapYawMisalignment
 from sim_backends.effects.steering import SteeringOffset
+from sim_backends.effects.uncatalogued import HeadingError
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +39,7 @@ log = logging.getLogger(__name__)
 class RivalCurve:
     """A measured curve of one dimension, whose fit takes seconds.
 
-    curve       id of the curve
+    curve       id of the curve, or of a sum of waves
     additional  effects and further curves that are fitted with it
     replaced    effects that it replaces in addition to those with this curve in ``represented_by``
     """
@@ -52,7 +59,9 @@ RIVAL_CURVES: dict[str, RivalCurve] = {
     for rival in (
         RivalCurve(SteeringCurve.id, additional=(SteeringOffset.id,), replaced=(SteeringOffset.id,)),
         RivalCurve(ThrottleCurve.id),
+        RivalCurve(HeadingError.id, replaced=(MocapYawMisalignment.id,)),
         RivalCurve(SideForceOverSpeed.id, additional=(YawMomentOverSpeed.id,), replaced=_TO_ONE_SIDE),
+        RivalCurve(SideForceOverSlip.id, additional=(YawMomentOverSlip.id,), replaced=_TO_ONE_SIDE),
     )
 }
 """By the id of the curve."""

@@ -13,7 +13,7 @@ from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit, refit_candidate
 from carlab.diagnosis.selection.screening import screen_candidates
-from sim_backends.effects import EFFECTS, Disturbance, MeasuredCurve
+from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.effects.curves import free_knots
 
 log = logging.getLogger(__name__)
@@ -104,8 +104,8 @@ def additional_physics(problem: SearchProblem, found: SearchResult, control: Run
 
 def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float, control: RunControl) -> list[Candidate]:
     """Rivals added to ``model`` whose screening scores are above ``min_score``, fitted, the highest score first."""
-    rivals = [e for e in EFFECTS.values() if not e.catalogued and not isinstance(e, (MeasuredCurve, Disturbance))]
-    names = [e.id for e in rivals if e.id not in problem.nominal.effects]
+    rivals = [e.id for e in EFFECTS.values() if e.is_general_rival and not e.catalogued]
+    names = [name for name in rivals if name not in problem.nominal.effects]
     screened = [result for result in screen_candidates(problem, model, names, control) if result.score > min_score]
     chosen = screened[: problem.settings.rivals.max_refits]
     fitted = control.workers.map(refit_candidate, [(problem, model, result) for result in chosen])
