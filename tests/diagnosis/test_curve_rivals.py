@@ -1,4 +1,4 @@
-"""Measured curves as rivals of named effects, on drives of a car with a known map, yaw moment or error of the heading."""
+"""Measured curves as rivals of named effects, on drives with a known map, force or error of the heading."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -157,7 +157,9 @@ def test_error_over_the_heading_replaces_a_yaw_misalignment() -> None:
     assert names == ("mocap_yaw_misalignment",)
     assert rival is not None
     assert (rival.effect, rival.names) == ("heading_error", ())
-    fitted = {name: rival.fit.values()[f"effects.heading_error.{name}"] for name in ("sin_2", "cos_2", "sin_1", "cos_1")}
+    fitted = {
+        name: rival.fit.values()[f"effects.heading_error.{name}"] for name in ("sin_2", "cos_2", "sin_1", "cos_1")
+    }
     true = {"sin_2": 0.03 * np.cos(1.0), "cos_2": 0.03 * np.sin(1.0), "sin_1": 0.0, "cos_1": 0.0}
     assert fitted == pytest.approx(true, abs=0.003)
 

@@ -29,7 +29,7 @@ from sim_backends.effects.force_curves import (
     YawMomentOverSpeed,
 )
 from sim_backends.effects.observations import MocapYawMisalignment
-from sim_backends.effects.steering import SteeringOffset
+from sim_backends.effects.steering import SteeringAsymmetry, SteeringOffset
 from sim_backends.effects.uncatalogued import HeadingError
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,9 @@ RIVAL_CURVES: dict[str, RivalCurve] = {
         RivalCurve(ThrottleCurve.id),
         RivalCurve(HeadingError.id, replaced=(MocapYawMisalignment.id,)),
         RivalCurve(SideForceOverSpeed.id, additional=(YawMomentOverSpeed.id,), replaced=_TO_ONE_SIDE),
-        RivalCurve(SideForceOverSlip.id, additional=(YawMomentOverSlip.id,), replaced=_TO_ONE_SIDE),
+        RivalCurve(
+            SideForceOverSlip.id, additional=(YawMomentOverSlip.id,), replaced=(*_TO_ONE_SIDE, SteeringAsymmetry.id)
+        ),
     )
 }
 """By the id of the curve."""
