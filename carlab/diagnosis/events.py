@@ -98,9 +98,11 @@ def find_events(episode: EpisodeData, config: SimulatorConfig) -> list[Event]:
         return []
     impacts = _impact_rows(stretches, config.parameters)
     found = []
-    for stretch, impact in zip(stretches, impacts, strict=True):
+    for stretch, (impact, above_grip) in zip(stretches, impacts, strict=True):
         carried = _carried_rows(stretch, config.parameters)
         for first, last in _merged(stretch.t_s, impact | carried, EVENTS.merge_s):
+            if not (above_grip | carried)[first : last + 1].any():
+                continue
             kind: Literal["impact", "carried"] = "carried" if carried[first : last + 1].any() else "impact"
             velocity, yaw_rate = stretch.change_over(first, last)
             began_s, ended_s = (float(stretch.t_s[k] - episode.times_s[0]) for k in (first, last))
@@ -114,6 +116,29 @@ def grip_limits(car: CarParameters) -> FloatArray:
     moment_per_grip = car.mass_kg * GRAVITY_MPS2 * car.front_axle_m * car.rear_axle_m / car.wheelbase_m
     yaw_acceleration = (car.front_mu + car.rear_mu) * moment_per_grip / car.yaw_inertia_kgm2
     return np.array([max(car.front_mu, car.rear_mu) * GRAVITY_MPS2, yaw_acceleration])
+
+
+def _grip_ratio(stretches: Sequence[_Stretch], car: CarParameters) -> float:
+    """Grip that the recording shows over that of the car file, at least 1.
+
+    The recording shows the accelerations that the car holds for several rows. A collision is shorter.
+    """
+    held = []
+    for stretch in stretches:
+        width = stretch.rows_of(EVENTS.widths_s[0])
+        changes = stretch.changes(width, 0)
+        is_moving = np.isfinite(changes.elapsed_s) & (stretch.speed_mps > EVENTS.moving_mps)
+        steady = _steady(changes, width)[is_moving]
+        held.append(np.hypot(steady[:, 0], steady[:, 1]) / changes.elapsed_s[is_moving])
+    held_mps2 = np.concatenate(held)
+    if len(held_mps2) < EVENTS.min_moving_rows:
+        return 1.0
+    return max(1.0, float(np.quantile(held_mps2, EVENTS.grip_quantile)) / float(grip_limits(car)[0]))
+
+
+def _steady(changes: _Changes, width: int) -> FloatArray:
+    """Steady part (n, 3) of the changes over ``width`` rows: a running median, which an impulse does not change."""
+    return np.asarray(median_filter(np.nan_to_num(changes.values), (EVENTS.steady_widths * width, 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,28 +201,35 @@ class _Stretch:
         return np.asarray((self.pose[last] - self.pose[first]) / (self.t_s[last] - self.t_s[first])[:, None])
 
 
-def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters) -> list[BoolArray]:
-    """Rows (n,) of each stretch around which velocity or yaw rate change too fast: stretches with a lasting change."""
-    fast, lasting = ([np.zeros(len(s.t_s), dtype=bool) for s in stretches] for _ in range(2))
-    limits = np.array(EVENTS.grip_factors) * grip_limits(car)
+def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters) -> list[tuple[BoolArray, BoolArray]]:
+    """Rows around which velocity or yaw rate change too fast, for each stretch.
+
+    Returns:
+        Rows (n,) of lasting changes beyond the grip of the car file, and those of them that are also beyond the grip of
+        the recording.
+    """
+    fast, lasting, above_grip = ([np.zeros(len(s.t_s), dtype=bool) for s in stretches] for _ in range(3))
+    limits, grip_ratio = np.array(EVENTS.grip_factors) * grip_limits(car), _grip_ratio(stretches, car)
     for width_s in EVENTS.widths_s:
         width = stretches[0].rows_of(width_s)
         changes = [s.changes(width, 0) for s in stretches]
         if not any(np.isfinite(c.elapsed_s).any() for c in changes):
             continue
-        steady = [median_filter(np.nan_to_num(c.values), (EVENTS.steady_widths * width, 1)) for c in changes]
+        steady = [_steady(c, width) for c in changes]
         usual = _usual_changes(stretches, changes, steady)
         for k, (stretch, change) in enumerate(zip(stretches, changes, strict=True)):
-            is_fast = change.sizes > np.maximum(limits * change.elapsed_s[:, None], usual)
+            limit = limits * change.elapsed_s[:, None]
+            is_fast = change.sizes > np.maximum(limit, usual)
             later = stretch.changes(stretch.rows_of(EVENTS.lasting_width_s), width)
             expected = steady[k] * (later.elapsed_s / change.elapsed_s)[:, None]
             lasts = np.minimum(_along(later.values, change), _along(later.values - expected, change))
             fast[k] |= is_fast.any(axis=1)
             lasting[k] |= (is_fast & (lasts >= EVENTS.lasting_share * change.sizes**2)).any(axis=1)
+            above_grip[k] |= (is_fast & (change.sizes > grip_ratio * limit)).any(axis=1)
     for is_fast, is_lasting in zip(fast, lasting, strict=True):
         for first, end in runs(is_fast):
             is_fast[first:end] = is_lasting[first:end].any()
-    return fast
+    return [(is_fast, is_fast & is_above) for is_fast, is_above in zip(fast, above_grip, strict=True)]
 
 
 def _along(later: FloatArray, change: _Changes) -> FloatArray:

@@ -66,6 +66,21 @@ def test_hard_driving_has_no_events(kind: str, seed: int) -> None:
     assert find_events(driven.episode, driven.config) == []
 
 
+def _with_grip(config: SimulatorConfig, factor: float) -> SimulatorConfig:
+    car = config.parameters
+    car = replace(car, front_mu=factor * car.front_mu, rear_mu=factor * car.rear_mu)
+    return replace(config, parameters=car)
+
+
+@pytest.mark.parametrize("factor", [0.2, 0.33, 0.6])
+@pytest.mark.parametrize(("kind", "seed"), [("", 11), ("", 12), ("effect", 46), ("blow", 1), ("turn", 3)])
+def test_a_small_grip_in_the_car_file_adds_no_events(kind: str, seed: int, factor: float) -> None:
+    """The car holds accelerations that its car file does not allow, so they are no events."""
+    driven = event_drive(seed, kind)
+    found = find_events(driven.episode, _with_grip(driven.config, factor))
+    assert driven.missed_and_false(found) == (0, 0)
+
+
 def test_wrong_rows_jumps_and_stamps_are_no_events() -> None:
     driven = event_drive(13)
     rng = np.random.default_rng(0)
