@@ -99,3 +99,24 @@ def test_commands_between_rows_are_reported_as_lost(clean):
     (action,) = [f.action for f in faults if f.id == "coarse_rows"]
     assert "rows are 0.099 s apart" in action
     assert "the recording lacks the commands between the rows" in action
+
+
+def test_commands_that_the_log_limits_are_reported(clean):
+    _, _, faults = check([with_sent(clean, lambda sent: np.clip(sent, -0.4, 0.4, out=sent))], [], NOMINAL)
+    found = {f.channel: f.action for f in faults}
+    assert {f.id for f in faults} == {"limited_commands"}
+    assert "at its limit of 0.4 and -0.4" in found["steering"]
+    assert "more than by this command: the log or the radio limits the command" in found["steering"]
+
+
+def test_audit_names_commands_that_the_log_limits(clean, tmp_path):
+    write_csv(with_sent(clean, lambda sent: np.clip(sent, -0.4, 0.4, out=sent)), tmp_path / "drive.csv")
+    found = import_csv(tmp_path / "drive.csv").report.of("limited_commands")
+    assert [f.channel for f in found] == ["steering", "throttle"]
+    assert "log the commands that the car executes" in found[0].sentence
+
+
+def test_a_driver_who_keeps_to_a_limit_is_no_fault():
+    limited = Car(command_limit=0.4).drive()
+    assert np.mean(np.abs(limited.sent[:, 0]) == 0.4) > 0.1
+    assert check([limited], [], NOMINAL)[2] == []

@@ -26,6 +26,7 @@ class Car:
     drag: float = 1.2
     mean_steering: float = 0.0
     rear_axle_m: float = 0.02
+    command_limit: float = 1.0
 
     def drive(self) -> EpisodeData:
         rng = np.random.default_rng(self.seed)
@@ -41,6 +42,7 @@ class Car:
         ticks = np.arange(count) // steps_per_row * steps_per_row
         steering = (self.mean_steering + 0.5 * random_signal(0.7) + 0.3 * random_signal(2.5))[ticks]
         throttle = np.clip(0.35 + 0.35 * random_signal(0.9) + 0.15 * random_signal(3.0), -1, 1)[ticks]
+        steering, throttle = (np.clip(u, -self.command_limit, self.command_limit) for u in (steering, throttle))
 
         def delayed(u: np.ndarray, delay_s: float) -> np.ndarray:
             shift = round(delay_s / step)

@@ -27,6 +27,7 @@ from carlab.recording.faults.commands import (
     wrong_command_sign,
 )
 from carlab.recording.faults.fault import Fault
+from carlab.recording.faults.limited_commands import limited_command
 from carlab.recording.faults.settings import LIMITS
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -78,6 +79,18 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
         if clear:
             _check_sign(repairs, clear, channel)
             _check_shift(repairs, responses, channel, expected_s)
+    for repair in repairs:
+        _check_limits(repair)
+
+
+def _check_limits(repair: EpisodeRepair) -> None:
+    """Report commands that the log or the radio limits: no repair, because the executed commands are unknown."""
+    motion = grid_motion(repair.times_s, repair.motion(), repair.segment)
+    for command, name in zip(repair.commands.T, COMMAND_CHANNELS, strict=True):
+        fault = limited_command(motion, repair.times_s, command, name)
+        if fault is not None:
+            remedy = "Log the commands that the car executes, without this limit"
+            repair.report(fault.id, name, len(fault.rows), f"reported: {fault.observation}. {remedy}.")
 
 
 def _exchange_columns(

@@ -7,6 +7,7 @@ from dataclasses import replace
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis
 from carlab.diagnosis.report.numbers import listed
+from carlab.diagnosis.report.recording_causes import limited_channels
 from carlab.diagnosis.report.residual import differs_when_held_out, relevant_residual, remaining_share
 from carlab.diagnosis.report.sentences import (
     effect_noun,
@@ -33,6 +34,8 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
         drive = next((m for m in MANOEUVRES if m in advice), "excitation")
         own = advice if advice != diagnosis.sentence else ""
         return drive, own or "Diagnose this drive together with these recordings."
+    if limited_channels(diagnosis) and diagnosis.verdict in ("mismatch", "unexplained"):
+        return "", "Record again with a log of the commands that the car executes, before another search for physics."
     if differs_when_held_out(diagnosis):
         return "", (
             "Compare both groups with carlab compare, which names what changed (50 s of driving in each group), or "

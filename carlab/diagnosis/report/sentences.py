@@ -13,6 +13,7 @@ from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
 from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, late_commands, parameters_at_limit, wrong_parameters
+from carlab.diagnosis.report.recording_causes import limited_channels, recording_causes
 from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import EVIDENCE, REPORT
@@ -214,6 +215,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         _with_uncatalogued(diagnosis),
         _with_curves(diagnosis),
         _with_drift(diagnosis),
+        recording_causes(diagnosis),
         search_sentences(diagnosis.search),
     )
     return f"{worse_than_constant_velocity(diagnosis)}{sentence_of_verdict(diagnosis)}{''.join(tails)}"
@@ -367,7 +369,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     where = listed([CHANNEL_NAMES.get(c, c) for c in rest.channels])
     shows = f" The error appears in {where}" if where else " The error appears"
     sentence = f"{text}.{shows}, {regime_clause(rest.regime)}."
-    if not diagnosis.search.is_complete:
+    if not diagnosis.search.is_complete or limited_channels(diagnosis):
         return sentence
     return f"{sentence} Class of the missing physics: {rest.kind or 'unknown'}."
 

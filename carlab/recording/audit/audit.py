@@ -37,6 +37,7 @@ from carlab.recording.faults.commands import (
 )
 from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.heading import heading_faults
+from carlab.recording.faults.limited_commands import limited_command
 from carlab.recording.faults.robust import LAGS_S, ColumnFit, correlation, fit_column, held_at
 from carlab.recording.faults.settings import LIMITS
 from carlab.recording.faults.stamps import nominal_clock, periods_by_distance
@@ -297,7 +298,7 @@ def _check_commands(
     mapping: ColumnMapping,
 ) -> list[Finding]:
     """Clock, sign and delay of both commands by their effect on the motion."""
-    findings = []
+    findings: list[Finding] = []
     executed_s = t_s - mapping.command_lag_s
     offset = clock_offset(grid, executed_s, list(sent.values()))
     if offset is not None:  # with another clock, sign and delay mean nothing
@@ -306,6 +307,9 @@ def _check_commands(
     if exchanged is not None:  # the columns of the file, before sign and delay
         names = " and ".join(f"'{mapping.columns[channel].name}'" for channel in COMMAND_CHANNELS)
         return [Finding.of_fault(exchanged, remedy=f"exchange the columns {names} in the mapping")]
+    limited = [limited_command(grid, executed_s, command, channel) for channel, command in sent.items()]
+    remedy = "log the commands that the car executes"
+    findings += [Finding.of_fault(fault, Severity.WARNING, remedy) for fault in limited if fault is not None]
     is_long = grid.rows.sum() >= MIN_ROWS
     for index, (channel, response) in enumerate(responses.items()):
         command = held_at(t_s, sent[channel], -mapping.command_lag_s)

@@ -111,7 +111,7 @@ def _even_times(t_s: FloatArray, step_s: float) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class _Regression:
+class CommandRegression:
     """Regression of the motion on functions of a delayed command, at every lag of ``LAGS_S``.
 
     Attributes:
@@ -131,7 +131,7 @@ class _Regression:
     next_row_weight: FloatArray
 
     @classmethod
-    def of(cls, motion: GridMotion, channel: str, rows: NDArray[np.intp]) -> _Regression:
+    def of(cls, motion: GridMotion, channel: str, rows: NDArray[np.intp]) -> CommandRegression:
         """The regression at rows of the grid."""
         vx, rate = motion.vx[rows], motion.yaw_rate[rows]
         columns = [np.ones_like(vx), vx, vx * np.abs(vx)]
@@ -188,12 +188,10 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
     if len(rows) < MIN_ROWS or np.std(command) < LIMITS.constant_command:
         return None
     rows = rows[:: max(1, len(rows) // 6000)]
-    regression = _Regression.of(motion, channel, rows)
+    regression = CommandRegression.of(motion, channel, rows)
     if float(regression.target @ regression.target) < 1e-9:
         return None
-    smooth = held_means(t_s, command, motion.t_s - 0.5 * motion.period_s, motion.period_s)
-    for span_s in motion.spans_s[: 1 + COMMAND_CHANNELS.index(channel)]:
-        smooth = _slope_average(smooth, round(span_s / motion.period_s))
+    smooth = averaged_as_motion(motion, t_s, command, channel)
     explained = np.zeros(len(LAGS_S))
     best_share, time_constant, lag, coefficients = -np.inf, 0.0, 0, np.zeros(0)
     for time_constant_s in TIME_CONSTANTS_S:
@@ -263,6 +261,14 @@ def reversed_yaw(responses: Sequence[CommandResponse | None]) -> Fault | None:
         "to the rear"
     )
     return Fault("wrong_frame", "yaw", observation, {"offset_rad": np.pi}, f"--yaw-offset {np.pi:.4f}")
+
+
+def averaged_as_motion(motion: GridMotion, t_s: FloatArray, values: FloatArray, channel: str) -> FloatArray:
+    """Values (N,), held from each of ``t_s`` (N,) on, averaged on the grid (n,) as the motion of a channel is."""
+    averaged = held_means(t_s, values, motion.t_s - 0.5 * motion.period_s, motion.period_s)
+    for span_s in motion.spans_s[: 1 + COMMAND_CHANNELS.index(channel)]:
+        averaged = _slope_average(averaged, round(span_s / motion.period_s))
+    return averaged
 
 
 def _slope_average(values: FloatArray, width: int) -> FloatArray:

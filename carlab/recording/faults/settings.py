@@ -96,6 +96,24 @@ class FaultSettings:
     constant_command: float = 0.02
     """Standard deviation of a command (full command = 1) below which it shows no effect."""
 
+    min_limit: float = 0.1
+    max_limit: float = 0.98
+    """Range of the size of a limit of the commands (full command = 1). A smaller one is rest, a larger one is the full
+    command."""
+    limit_tolerance: float = 1e-3
+    """Largest difference from the limit (full command = 1) of a command that is at it. Radios have 1000 steps."""
+    limited_share: float = 0.03
+    """Minimum share of rows at a limit. A largest command that is no limit has a smaller one."""
+    min_limited_rows: int = 30
+    """Minimum number of rows of the grid (20 ms or a period) at the limit that are compared."""
+    limited_explained: float = 0.7
+    """Minimum share of the motion that the command explains far from its limit, so that a fit can be compared."""
+    limited_excess: float = 0.15
+    limited_excess_sigmas: float = 3.0
+    """Minimum excess of the motion at the limit: share of what the command causes, and standard deviations of the fit.
+    A log that ends at 0.6 causes 0.29 to 0.44 and 6 to 12 for steering. Drivers who keep to 0.6 cause at most 0.09 and
+    2.2."""
+
     offset_range_s: float = 10.0
     """[s] Largest searched offset between the clocks of commands and poses. Larger ones are errors of a date."""
     offset_range_share: float = 1.0 / 3.0
