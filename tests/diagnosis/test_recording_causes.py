@@ -1,9 +1,60 @@
-"""The report states faults of the recording that look like physics: limited commands."""
+"""The report states faults of the recording that look like physics: limited commands and filtered poses."""
 
-from carlab.diagnosis.findings import DataFault
-from tests.diagnosis.report_material import changed, unexplained_physics
+from dataclasses import replace
+
+import pytest
+
+from carlab.diagnosis.findings import DataFault, EffectFinding
+from carlab.diagnosis.report.recording_causes import recording_causes
+from tests.diagnosis.report_material import changed, estimate, lag_finding, mismatch, unexplained_physics
 
 LIMITED = DataFault("limited_commands", "steering", 900, "reported: the log or the radio limits the command.")
+
+
+def lag(effect_id: str, parameter: str, value_s: float) -> EffectFinding:
+    finding = replace(lag_finding(), id=effect_id, parameters={parameter: estimate(value_s, 0.003, "s")})
+    return replace(finding, indistinguishable_from=(), separating_drive="")
+
+
+STEERING_LAG = lag("steering_lag", "time_constant", 0.06)
+MOTOR_LAG = lag("motor_lag", "time_constant", 0.05)
+LATENCY = lag("mocap_latency", "latency", 0.05)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (STEERING_LAG, MOTOR_LAG),
+        (lag("steering_delay", "delay", 0.015), lag("throttle_delay", "delay", 0.012)),
+        (MOTOR_LAG, lag("steering_delay", "delay", 0.05), lag("mocap_latency", "latency", 0.0)),
+        (lag("command_delay", "extra_delay", 0.05), lag("motor_lag", "time_constant", 0.02)),
+    ],
+)  # fmt: skip
+def test_equal_delays_of_both_commands_may_be_a_filter_of_the_poses(effects: tuple[EffectFinding, ...]) -> None:
+    sentence = changed(mismatch(), effects=effects).sentence
+    assert "A filter of the poses in the motion-capture software makes both late by a similar time" in sentence
+    assert "Switch off the smoothing" in sentence
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (STEERING_LAG,),
+        (STEERING_LAG, lag("motor_lag", "time_constant", 0.2)),
+        (lag("command_delay", "extra_delay", 0.05),),
+        (LATENCY, lag("velocity_filter_lag", "time_constant", 0.05)),
+    ],
+)
+def test_other_delays_are_no_filter_of_the_poses(effects: tuple[EffectFinding, ...]) -> None:
+    assert recording_causes(changed(mismatch(), effects=effects)) == ""
+
+
+def test_latency_counts_in_addition_to_that_of_the_car_file() -> None:
+    """A latency of 50 ms in place of 49 ms delays nothing."""
+    effects = (lag("steering_lag", "time_constant", 0.02), LATENCY)
+    known = changed(mismatch(), effects=effects, car_file_parameters={"mocap.latency": 0.049})
+    assert recording_causes(known) == ""
+    assert "The steering is 0.07 s late and the drive 0.05 s." in recording_causes(changed(mismatch(), effects=effects))
 
 
 def test_limited_commands_replace_the_class_of_missing_physics() -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from carlab.diagnosis.findings import Diagnosis
-from carlab.diagnosis.report.numbers import listed
+from carlab.diagnosis.findings import Diagnosis, EffectFinding
+from carlab.diagnosis.report.numbers import listed, with_unit
+from carlab.diagnosis.settings import REPORT
+from sim_backends.effects import EFFECTS
 
 LIMITED = "limited_commands"
 
 
 def recording_causes(diagnosis: Diagnosis) -> str:
-    """Sentences, each after a space, about limited commands; empty without them."""
-    return _limited_commands(diagnosis)
+    """Sentences, each after a space, about limited commands and filtered poses; empty without a sign of them."""
+    return f"{_limited_commands(diagnosis)}{_filtered_poses(diagnosis)}"
 
 
 def limited_channels(diagnosis: Diagnosis) -> list[str]:
@@ -27,3 +29,34 @@ def _limited_commands(diagnosis: Diagnosis) -> str:
         f" The log or the radio limits the {listed(channels)}. The simulator has too small commands there, which looks "
         "like missing physics. Log the commands that the car executes, record again, and diagnose again."
     )
+
+
+def _filtered_poses(diagnosis: Diagnosis) -> str:
+    """That a filter of the poses looks the same as the named delays and lags of steering and drive."""
+    lags_s = {e.id: lag for e in diagnosis.effects if (lag := _lag_s(e, diagnosis)) is not None}
+    shared = [name for name, effect in EFFECTS.items() if effect.split_into]
+    groups = EFFECTS[shared[0]].split_into
+    n_single = sum(any(name in lags_s for name in group) for group in groups)
+    if n_single < len(groups) and not (n_single and any(name in lags_s for name in shared)):
+        return ""
+    both_s = sum(lags_s.get(name, 0.0) for name in shared)
+    steering_s, drive_s = (both_s + sum(lags_s.get(name, 0.0) for name in group) for group in groups)
+    if min(steering_s, drive_s) <= REPORT.filter_lag_ratio * max(steering_s, drive_s):
+        return ""
+    return (
+        f" The steering is {with_unit(steering_s, 's')} late and the drive {with_unit(drive_s, 's')}. A filter of the "
+        "poses in the motion-capture software makes both late by a similar time, and recordings do not distinguish it "
+        "from delays and lags of the car. Switch off the smoothing of the software and record again, or compare the "
+        "yaw rate with that of a gyroscope on the car."
+    )
+
+
+def _lag_s(effect: EffectFinding, diagnosis: Diagnosis) -> float | None:
+    """Delay or time constant of an effect [s] in addition to that of the car file; None for other effects."""
+    if effect.id not in EFFECTS or not EFFECTS[effect.id].lag_parameter:
+        return None
+    (parameter,) = (p for p in EFFECTS[effect.id].parameters if p.name == EFFECTS[effect.id].lag_parameter)
+    stated = effect.car_file_values.get(parameter.name)
+    if stated is None:
+        stated = diagnosis.car_file_parameters.get(parameter.same_as or "", parameter.identity or 0.0)
+    return effect.parameters[parameter.name].value - stated
