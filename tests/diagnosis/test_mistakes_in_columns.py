@@ -1,5 +1,6 @@
 """Mistakes of a log are faults of the recording and no physics: other sensors, late poses, exchanged columns."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -120,3 +121,28 @@ def test_a_driver_who_keeps_to_a_limit_is_no_fault():
     limited = Car(command_limit=0.4).drive()
     assert np.mean(np.abs(limited.sent[:, 0]) == 0.4) > 0.1
     assert check([limited], [], NOMINAL)[2] == []
+
+
+@pytest.mark.parametrize(("factor", "where"), [(1.2, "too far apart"), (0.5, "too close together")])
+def test_one_factor_of_all_velocities_is_a_wrong_frame_rate(clean, factor, where):
+    stretched = replace(clean, times_s=clean.times_s * factor)
+    (fit,), _, (fault,) = check([stretched], [], NOMINAL)
+    assert (fault.id, fault.channel) == ("wrong_frame_rate", "t, vx, vy, yaw_rate")
+    assert f"probably the stamps are {where} (a wrong frame rate)" in fault.action
+    remedy = re.search(r"if the stamps are wrong, multiply them by (\S+) and diagnose again", fault.action)
+    assert float(remedy[1]) == pytest.approx(1.0 / factor, rel=0.01)
+    np.testing.assert_allclose(fit.states[:, VX:] * factor, clean.states[:, VX:], rtol=0.02, atol=0.01)
+
+
+def test_different_factors_are_faults_of_the_columns(clean):
+    def scale(states: np.ndarray) -> None:
+        states[:, VX:] *= [1.2, 1.2, 1.4]
+
+    _, _, faults = check([with_states(clean, scale)], [], NOMINAL)
+    assert [(f.id, f.channel) for f in faults] == [("column_scale", "vx"), ("column_scale", "yaw_rate")]
+
+
+def test_audit_names_a_wrong_frame_rate(clean, tmp_path):
+    write_csv(replace(clean, times_s=clean.times_s * 1.2), tmp_path / "drive.csv")
+    (finding,) = import_csv(tmp_path / "drive.csv").report.of("wrong_frame_rate")
+    assert "if the stamps are wrong, multiply them by 0.83" in finding.sentence

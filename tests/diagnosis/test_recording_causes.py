@@ -1,4 +1,4 @@
-"""The report states faults of the recording that look like physics: limited commands and filtered poses."""
+"""The report states faults of the recording that look like physics: limited commands, stamps and filtered poses."""
 
 from dataclasses import replace
 
@@ -63,3 +63,8 @@ def test_limited_commands_replace_the_class_of_missing_physics() -> None:
     assert "Class of the missing physics" not in limited.sentence
     assert "The log or the radio limits the steering." in limited.sentence
     assert limited.advice.startswith("Record again with a log of the commands that the car executes")
+
+
+def test_wrong_frame_rate_is_stated_with_the_verdict() -> None:
+    fault = DataFault("wrong_frame_rate", "t, vx, vy, yaw_rate", 900, "repaired: the velocities were multiplied.")
+    assert "The stamps probably have a wrong frame rate" in changed(mismatch(), data_faults=(fault,)).sentence

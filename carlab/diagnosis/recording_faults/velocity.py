@@ -25,6 +25,7 @@ from carlab.recording.faults.velocity import (
     spike_fault,
     velocity_references,
     velocity_spikes,
+    wrong_frame_rate,
     wrong_velocity_frame,
 )
 from carlab.recording.pose_velocity import PoseMotion
@@ -81,8 +82,7 @@ def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
         vx, vy = repair.states[:, 3:5].T.copy()
         repair.states[:, 3], repair.states[:, 4] = to_world(vx, vy, np.asarray(rotated.evidence["offset_rad"]))
         repair.repaired(rotated, "vx and vy were rotated back by that angle")
-    for channel in VELOCITY_CHANNELS:
-        _check_scale(repair, motion, channel)
+    _check_scales(repair, motion)
     for channel in VELOCITY_CHANNELS:
         _check_spikes(repair, motion, channel)
 
@@ -96,18 +96,35 @@ def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
     repair.repaired(fault, "the velocities were rotated by the yaw")
 
 
-def _check_scale(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> None:
-    """Sign, unit and factor of one column."""
-    column = repair.states[:, 3 + VELOCITY_CHANNELS.index(channel)]
-    reference, rows = velocity_references(motion)[channel], comparable_rows(motion, channel)
-    for fault in scale_faults(channel, fit_column(repair.times_s, reference, column, rows), reference[rows]):
-        factor = fault.evidence.get("factor")
-        if factor is None:
+def _check_scales(repair: EpisodeRepair, motion: PoseMotion) -> None:
+    """Sign, unit and factor of each column; one factor of all columns is a fault of the stamps."""
+    faults = [fault for channel in VELOCITY_CHANNELS for fault in _scale_faults(repair, motion, channel)]
+    common = wrong_frame_rate(faults)
+    if common is not None:
+        factor = common.evidence["factor"]
+        repair.states[:, 3:] *= factor
+        remedy = (
+            f"the velocities were multiplied by {factor:.4g}. Compare the length of the recording with a clock; if the "
+            f"stamps are wrong, multiply them by {factor:.4g} and diagnose again, because all forces and delays depend "
+            "on them"
+        )
+        repair.repaired(common, remedy)
+        return
+    for fault in faults:
+        column_factor = fault.evidence.get("factor")
+        if column_factor is None:
             repair.has_velocity_columns = False
             repair.repaired(fault, "the velocities were estimated from the pose")
         else:
-            column *= factor
-            repair.repaired(fault, f"multiplied by {factor:.4g}")
+            repair.states[:, 3 + VELOCITY_CHANNELS.index(fault.channel)] *= column_factor
+            repair.repaired(fault, f"multiplied by {column_factor:.4g}")
+
+
+def _scale_faults(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> list[Fault]:
+    """Faults of sign, unit and factor of one column."""
+    column = repair.states[:, 3 + VELOCITY_CHANNELS.index(channel)]
+    reference, rows = velocity_references(motion)[channel], comparable_rows(motion, channel)
+    return scale_faults(channel, fit_column(repair.times_s, reference, column, rows), reference[rows])
 
 
 def _check_spikes(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> None:

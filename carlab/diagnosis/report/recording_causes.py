@@ -7,12 +7,13 @@ from carlab.diagnosis.report.numbers import listed, with_unit
 from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
 
-LIMITED = "limited_commands"
+LIMITED, FRAME_RATE = "limited_commands", "wrong_frame_rate"
+"""Ids of faults."""
 
 
 def recording_causes(diagnosis: Diagnosis) -> str:
-    """Sentences, each after a space, about limited commands and filtered poses; empty without a sign of them."""
-    return f"{_limited_commands(diagnosis)}{_filtered_poses(diagnosis)}"
+    """Sentences, each after a space, about limited commands, stamps and filtered poses; empty without these."""
+    return f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{_filtered_poses(diagnosis)}"
 
 
 def limited_channels(diagnosis: Diagnosis) -> list[str]:
@@ -28,6 +29,16 @@ def _limited_commands(diagnosis: Diagnosis) -> str:
     return (
         f" The log or the radio limits the {listed(channels)}. The simulator has too small commands there, which looks "
         "like missing physics. Log the commands that the car executes, record again, and diagnose again."
+    )
+
+
+def _wrong_frame_rate(diagnosis: Diagnosis) -> str:
+    """That a wrong frame rate changes forces and delays."""
+    if all(fault.id != FRAME_RATE for fault in diagnosis.data_faults):
+        return ""
+    return (
+        " The stamps probably have a wrong frame rate, which changes all forces and delays: compare the length of the "
+        "recording with a clock before anything else."
     )
 
 

@@ -48,6 +48,7 @@ from carlab.recording.faults.velocity import (
     velocity_lag,
     velocity_references,
     velocity_spikes,
+    wrong_frame_rate,
     wrong_velocity_frame,
 )
 from carlab.recording.pose_velocity import BoolArray, PoseMotion
@@ -195,6 +196,12 @@ def _check_velocities(
     if "yaw_rate" in columns:
         found, spikes = _check_yaw_rate(t_s, values["yaw_rate"], motion, mapping)
         findings += found
+    rate = wrong_frame_rate([Fault(f.id, f.channel, f.sentence, f.evidence) for f in findings])
+    if rate is not None:
+        remedy = (
+            f"compare its length with a clock; if the stamps are wrong, multiply them by {rate.evidence['factor']:.4g}"
+        )
+        findings.append(Finding.of_fault(rate, Severity.WARNING, remedy))
     estimated = [name for name in VELOCITY_CHANNELS if name not in columns]
     return findings + (_estimated_velocities(estimated, values, motion, mapping) if estimated else []), spikes
 

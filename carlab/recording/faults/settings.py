@@ -53,6 +53,9 @@ class FaultSettings:
     """A factor this far from 1 is a fault. A filter of another kind than first order leaves 2 to 3 %."""
     unit_share: float = 0.1
     """A factor this near to that of a unit is that unit. The known units are a factor 2.8 or more apart."""
+    common_scale_share: float = 0.05
+    """Largest relative difference of the factors of the velocities that count as one. A wrong frame rate leaves 0.2 %,
+    and noise some per cent in vy."""
     scale_unexplained: tuple[float, float] = (0.02, 0.1)
     """Unexplained variance up to which a factor is accepted: between 3/4 and 4/3, and beyond. A larger remainder next
     to a factor near 1 is a filter, vibration between the rows, or noise."""

@@ -7,7 +7,7 @@ alike. A filter behind the velocities is fitted and is no fault.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -125,6 +125,35 @@ def scale_faults(channel: str, fit: ColumnFit, reference: FloatArray) -> list[Fa
     option = " ".join(f"--{name.replace('_', '-')}-{what}" for name in names)
     identity = "wrong_unit" if unit else "column_scale"
     return [*faults, Fault(identity, channel, observation, evidence | {"factor": factor}, option)]
+
+
+def wrong_frame_rate(faults: Sequence[Fault]) -> Fault | None:
+    """The fault of stamps that run too fast or too slow: the velocities have one factor against the pose.
+
+    Args:
+        faults: those of ``scale_faults``. Small lateral velocities have none, because noise hides their factor.
+
+    Returns:
+        The fault with ``factor`` in its evidence, by which to multiply the stamps or else all velocities.
+    """
+    slopes = {
+        channel: fault.evidence["slope"]
+        for fault in faults
+        if "factor" in fault.evidence and fault.id != "wrong_sign"
+        for channel in fault.channel.split(", ")
+    }
+    if not {"vx", "yaw_rate"} <= slopes.keys():
+        return None
+    values = np.array(list(slopes.values()))
+    scale = float(values.mean())
+    if values.min() <= 0.0 or np.ptp(values) > LIMITS.common_scale_share * scale:
+        return None
+    observation = (
+        f"{', '.join(slopes)} are all {scale:.4g} times the motion of the pose: probably the stamps are too "
+        f"{'far apart' if scale > 1.0 else 'close together'} (a wrong frame rate), or else the velocities have this "
+        "wrong scale"
+    )
+    return Fault("wrong_frame_rate", ", ".join(("t", *VELOCITY_CHANNELS)), observation, {"factor": 1.0 / scale})
 
 
 @dataclass(frozen=True, slots=True)
