@@ -78,6 +78,27 @@ def test_exchanged_command_columns_are_repaired(clean, held):
     np.testing.assert_array_equal(out[0].sent, held.sent)
 
 
+def exchanged_and_late(episode: EpisodeData, rows: int) -> EpisodeData:
+    """The columns of both commands are exchanged, and each command is in a row that is ``rows`` later."""
+    return with_sent(episode, lambda sent: sent.__setitem__(slice(None), np.roll(sent[:, ::-1], rows, axis=0).copy()))
+
+
+@pytest.mark.parametrize("offset_s", [0.3, 1.0, -2.0])
+def test_exchanged_commands_of_another_clock_are_repaired(clean, offset_s):
+    (fit,), _, faults = check([exchanged_and_late(clean, round(offset_s * 30.0))], [], NOMINAL)
+    assert faults[0].id == "exchanged_columns"
+    assert {f.id for f in faults[1:]} == {"column_shift" if abs(offset_s) < 0.5 else "clock_offset"}
+    rows = np.searchsorted(clean.times_s, fit.times_s[:-1])
+    agree = np.abs(fit.sent - clean.sent[rows])[90:-90] < 0.15
+    assert agree.mean() > 0.95
+
+
+@pytest.mark.parametrize("offset_s", [0.3, -2.0])
+def test_audit_names_exchanged_commands_of_another_clock(clean, tmp_path, offset_s):
+    write_csv(exchanged_and_late(clean, round(offset_s * 30.0)), tmp_path / "drive.csv")
+    assert len(import_csv(tmp_path / "drive.csv").report.of("exchanged_columns")) == 1
+
+
 def test_audit_names_exchanged_command_columns(clean, tmp_path):
     write_csv(with_sent(clean, exchange), tmp_path / "drive.csv")
     (finding,) = import_csv(tmp_path / "drive.csv").report.of("exchanged_columns")

@@ -13,14 +13,13 @@ import numpy as np
 
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
 from carlab.recording.column_mapping import COMMAND_CHANNELS
-from carlab.recording.faults.clock_offset import clock_offset
+from carlab.recording.faults.clock_offset import clock_offset, exchanged_with_offset
 from carlab.recording.faults.command_clock import WINDOW_S, WindowLags, clock_rate, window_lags
 from carlab.recording.faults.commands import (
     LAGS_S,
     CommandResponse,
     GridMotion,
     command_response,
-    exchanged_commands,
     grid_motion,
     moves_backward,
     reversed_yaw,
@@ -67,6 +66,8 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
     pairs = list(zip(repairs, motions, strict=True))
     by_recording = [_responses(repair, motion) for repair, motion in pairs]
     if _exchange_columns(repairs, motions, by_recording):
+        motions = _motions_after_clock_offsets(repairs, expected_s)
+        pairs = list(zip(repairs, motions, strict=True))
         by_recording = [_responses(repair, motion) for repair, motion in pairs]
     is_restamped = _check_clock(repairs, motions, by_recording)
     by_recording = [
@@ -100,7 +101,7 @@ def _exchange_columns(
 ) -> bool:
     """Exchange both commands of the recordings with that fault, and of all if none follows a command of its own."""
     faults = [
-        exchanged_commands(motion, repair.times_s, list(repair.commands.T), own)
+        exchanged_with_offset(motion, repair.times_s, list(repair.commands.T), own)
         for repair, motion, own in zip(repairs, motions, responses, strict=True)
     ]
     known = next((fault for fault in faults if fault is not None), None)

@@ -23,13 +23,12 @@ from carlab.recording.column_mapping import (
     ColumnMapping,
     ColumnSource,
 )
-from carlab.recording.faults.clock_offset import clock_offset
+from carlab.recording.faults.clock_offset import clock_offset, exchanged_with_offset
 from carlab.recording.faults.commands import (
     MIN_ROWS,
     CommandResponse,
     GridMotion,
     command_response,
-    exchanged_commands,
     grid_motion,
     moves_backward,
     reversed_yaw,
@@ -310,7 +309,7 @@ def _check_commands(
     offset = clock_offset(grid, executed_s, list(sent.values()))
     if offset is not None:  # with another clock, sign and delay mean nothing
         return [_clock_finding(offset, t_s, mapping)]
-    exchanged = exchanged_commands(grid, executed_s, list(sent.values()), list(responses.values()))
+    exchanged = exchanged_with_offset(grid, executed_s, list(sent.values()), list(responses.values()))
     if exchanged is not None:  # the columns of the file, before sign and delay
         names = " and ".join(f"'{mapping.columns[channel].name}'" for channel in COMMAND_CHANNELS)
         return [Finding.of_fault(exchanged, remedy=f"exchange the columns {names} in the mapping")]

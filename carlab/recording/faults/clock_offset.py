@@ -14,7 +14,15 @@ from scipy.signal import fftconvolve
 
 from carlab.core.quantities import FloatArray
 from carlab.recording.column_mapping import COMMAND_CHANNELS
-from carlab.recording.faults.commands import LAGS_S, MIN_ROWS, GridMotion, command_response
+from carlab.recording.faults.commands import (
+    LAGS_S,
+    MIN_ROWS,
+    CommandResponse,
+    GridMotion,
+    command_response,
+    exchanged_commands,
+    explain_too_little,
+)
 from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.robust import first_order_lag, held_means
 from carlab.recording.faults.settings import LIMITS
@@ -58,6 +66,21 @@ def clock_offset(motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatAr
     )
     evidence = {"delay_s": delay_s, "unexplained_ratio": ratio}
     return Fault("clock_offset", ", ".join(COMMAND_CHANNELS), observation, evidence)
+
+
+def exchanged_with_offset(
+    motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatArray], responses: Sequence[CommandResponse | None]
+) -> Fault | None:
+    """The fault as by ``exchanged_commands``, also if the clock of the commands differs by seconds."""
+    fault = exchanged_commands(motion, t_s, commands, responses)
+    if fault is not None or not explain_too_little(responses):
+        return fault
+    offset = clock_offset(motion, t_s, commands[::-1])
+    if offset is None:
+        return None
+    shifted_s = t_s + offset.evidence["delay_s"]
+    own = [command_response(motion, shifted_s, u, name) for name, u in zip(COMMAND_CHANNELS, commands, strict=True)]
+    return exchanged_commands(motion, shifted_s, commands, own)
 
 
 def _lag_correlation(motion: GridMotion, t_s: FloatArray, command: FloatArray, channel: str) -> FloatArray:

@@ -227,7 +227,7 @@ def exchanged_commands(
         commands: steering and throttle, (N,) each.
         responses: responses to these commands.
     """
-    if any(r is None or r.best >= share for r, share in zip(responses, LIMITS.command_explained, strict=True)):
+    if not explain_too_little(responses):
         return None
     explained = []
     for channel, command, share in zip(COMMAND_CHANNELS, reversed(commands), LIMITS.command_explained, strict=True):
@@ -240,6 +240,11 @@ def exchanged_commands(
         f"{explained[1]:.0%} of the acceleration"
     )
     return Fault("exchanged_columns", "steering, throttle", observation)
+
+
+def explain_too_little(responses: Sequence[CommandResponse | None]) -> bool:
+    """Whether both commands change and neither explains the motion of its own channel."""
+    return all(r is not None and r.best < share for r, share in zip(responses, LIMITS.command_explained, strict=True))
 
 
 def moves_backward(motion: PoseMotion) -> bool:
