@@ -106,6 +106,18 @@ class SimulatorConfig:
         for channel, delay_s in zip(("steering", "throttle"), self.delays_s(), strict=True):
             if delay_s < 0.0:
                 raise ConfigError(f"The delay of {channel} adds up to {delay_s:g} s; raise command_delay to 0 or more.")
+        self._check_ranges_of_effects(values)
+
+    def _check_ranges_of_effects(self, values: Mapping[str, float]) -> None:
+        """Raise ConfigError for a number of an effect that other numbers of the car file exclude."""
+        for effect_id in self.effects:
+            for parameter, (low, high) in EFFECTS[effect_id].ranges(values).items():
+                name = f"effects.{effect_id}.{parameter}"
+                if not low <= values[name] <= high:
+                    raise ConfigError(
+                        f"{name} is {values[name]:g} {REGISTRY[name].unit}; in this car it must be between {low:.3g} "
+                        f"and {high:.3g}."
+                    )
 
     def _default_of(self, info: ParameterInfo) -> float:
         if info.default is not None:

@@ -158,6 +158,10 @@ class Effect:
         """
         return None
 
+    def ranges(self, values: Mapping[str, float]) -> Mapping[str, tuple[float, float]]:
+        """Ranges (low, high) by parameter that depend on numbers of the car file, ``values`` by dotted name."""
+        return {}
+
     def required_method(self) -> str:
         """Name of the method that a subclass has to define; "" without one. ``register`` refuses an effect without."""
         return ""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Parameters
 
@@ -44,7 +46,8 @@ class Wheelbase(DynamicsEffect):
 class CentreOfMass(DynamicsEffect):
     """``l_f = l_f,0 - ahead`` and ``l_r = l_r,0 + ahead``: the tracked centre of mass is elsewhere between the axles.
 
-    The axle loads change with it. An axle stays at least 2 % of the wheelbase away from the centre of mass.
+    The axle loads change with it. A shift beyond an axle of the car file is refused. In a step an axle stays at least
+    2 % of the wheelbase away from the centre of mass.
     """
 
     id = "centre_of_mass"
@@ -64,6 +67,10 @@ class CentreOfMass(DynamicsEffect):
             "only the centre of mass changes how strongly each axle turns the car",
         ),
     )
+
+    def ranges(self, values: Mapping[str, float]) -> Mapping[str, tuple[float, float]]:
+        """The centre of mass is between the axles of the car file."""
+        return {"ahead": (-values["vehicle.rear_axle"], values["vehicle.front_axle"])}
 
     def axle_distances_m(self, ops: Ops, front_m: Value, rear_m: Value, values: Parameters) -> tuple[Value, Value]:
         """Move the point between the axles."""

@@ -39,6 +39,16 @@ def test_simulator_accepts_the_bounds_of_every_effect(kind, effect, z):
 
 
 @pytest.mark.parametrize("z", [-1e3, 1e3])
+def test_centre_of_mass_of_a_fit_stays_between_axles_that_are_fitted_too(z):
+    car = SimulatorConfig(priors={"vehicle.front_axle": (0.1, 0.2), "vehicle.rear_axle": (0.12, 0.2)})
+    (free,) = effect_parameters("centre_of_mass", car)
+    value = float(free.value(np.array(z)))
+    assert value == (-0.12 if z < 0.0 else 0.1)
+    lowest = {"vehicle.front_axle": 0.1, "vehicle.rear_axle": 0.12, free.name: value}
+    assert car.with_values(lowest).values()[free.name] == value
+
+
+@pytest.mark.parametrize("z", [-1e3, 1e3])
 def test_range_of_the_car_file_bounds_the_parameter_of_an_effect(z):
     """The car file f1tenth states a range of the force; a fit beyond it ended the diagnosis with an error."""
     car = SimulatorConfig.from_preset("f1tenth")

@@ -56,11 +56,20 @@ def test_effects_equal_a_car_file_with_these_distances():
     assert driven(config, start) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("ahead_m", [0.5, -0.5])
-def test_centre_of_mass_stays_between_the_axles(ahead_m):
-    front_m, rear_m = SimulatorConfig(CAR, effects={"centre_of_mass": {"ahead": ahead_m}}).axle_distances_m()
-    assert front_m + rear_m == pytest.approx(CAR.wheelbase_m)
-    assert min(front_m, rear_m) == pytest.approx(0.02 * CAR.wheelbase_m)
+@pytest.mark.parametrize("change", [-0.7, -0.5])
+@pytest.mark.parametrize("ahead_m", [0.12, -0.15])
+def test_centre_of_mass_stays_between_the_axles_of_a_shorter_car(ahead_m, change):
+    effects = {"centre_of_mass": {"ahead": ahead_m}, "wheelbase": {"change": change}}
+    front_m, rear_m = SimulatorConfig(CAR, effects=effects).axle_distances_m()
+    assert front_m + rear_m == pytest.approx((1.0 + change) * CAR.wheelbase_m)
+    assert min(front_m, rear_m) == pytest.approx(0.02 * (1.0 + change) * CAR.wheelbase_m)
+
+
+@pytest.mark.parametrize("ahead_m", [0.4, -0.4])
+def test_centre_of_mass_beyond_an_axle_is_refused(ahead_m):
+    message = rf"effects.centre_of_mass.ahead is {ahead_m:g} m; in this car it must be between -0.\d+ and 0.\d+."
+    with pytest.raises(ConfigError, match=message):
+        SimulatorConfig(CAR, effects={"centre_of_mass": {"ahead": ahead_m}})
 
 
 def test_wheelbase_cannot_vanish():

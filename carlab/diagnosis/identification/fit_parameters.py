@@ -125,6 +125,7 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
     """
     found = []
     values, stated_by_name = config.values(), stated_values(config, effect_id)
+    ranges = EFFECTS[effect_id].ranges(values | {name: low for name, (low, _) in config.priors.items()})
     for p in EFFECTS[effect_id].parameters:
         name = f"effects.{effect_id}.{p.name}"
         size = abs(p.typical) or 1.0
@@ -142,6 +143,8 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
             if p.reduces:
                 low = max(low, -values[p.reduces])
             high = min(p.high, max(identity + 20.0 * size, origin))
+            lowest, highest = ranges.get(p.name, (low, high))
+            low, high = max(low, lowest), min(high, highest)
             found.append(FitParameter(name, origin, size, low, high, is_delay=p.is_delay))
     return tuple(_within_range(each, config) for each in found)
 
