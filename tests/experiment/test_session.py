@@ -94,7 +94,7 @@ def test_person_is_not_asked_to_place_the_car_outside_the_arena(tmp_path: Path) 
         car.place = lambda state: False  # type: ignore[method-assign]
         placed_by_hand: list[CarState] = []
         hooks, envelope = RunHooks(place_by_hand=placed_by_hand.append), SafetyEnvelope(arena_m=rectangle(2, 4, 2, 4))
-        with pytest.raises(ConfigError, match=r"^The start \(1\.\d+, -1\.\d+\) m is outside the arena; enlarge"):
+        with pytest.raises(ConfigError, match=r"^The start pose \(1\.\d+, -1\.\d+\) m is outside the arena; enlarge"):
             make_session(car, Forward(), tmp_path, hooks, envelope).drive(1)
     assert placed_by_hand == []
     assert car.armed_at_mps == []

@@ -60,7 +60,7 @@ class SelectionSettings:
     """Whitened errors on left-out blocks are clipped here [standard deviations], to limit the influence of one spin."""
     accept_chi2_min: float = 25.0
     """Minimum chi2 (twice the gain over the design effect) of an accepted effect with one parameter; well above the
-    usual limit of one test, because 40 candidates are compared."""
+    usual limit of one test, because all candidates of the catalogue are compared."""
     accept_chi2_per_number: float = 8.0
     """Additional chi2 per additional parameter and for an infinite identity value."""
     accept_left_out_share: float = 0.015

@@ -198,8 +198,8 @@ def _require_inside(envelope: SafetyEnvelope, start: CarState) -> None:
     """Raise ConfigError if a person would have to place the car outside the arena, where each episode ends at once."""
     if envelope.arena_m and not contains(envelope.arena_m, start.x_m, start.y_m):
         raise ConfigError(
-            f"The start ({start.x_m:.2f}, {start.y_m:.2f}) m is outside the arena; enlarge the arena (that of the car "
-            "file, else that of the task), or start at the car's current pose (drive: --no-place)."
+            f"The start pose ({start.x_m:.2f}, {start.y_m:.2f}) m is outside the arena; enlarge the arena (that of the "
+            "car file, else that of the task), or start at the car's current pose (drive: --no-place)."
         )
 
 
