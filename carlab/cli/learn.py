@@ -73,9 +73,9 @@ class Learn:
     """The prior simulator: nominal (the default: the car file), kinematic (the car file without tyre slip), auto, or
     FILE.toml (for example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and
     parameters that the recordings support are added to the prior, and those that they contradict are removed; the run
-    prints each change. Parameters lie in the ranges of the file. If the file states any range or standard deviation,
-    its other numbers are exact; if it states none, drive gain, damping, maximum steering angle, yaw inertia and B and
-    mu of the tyres lie within 30 % of their values. With kinematic, only the first three of these are uncertain."""
+    prints each change. Parameters lie in the ranges of the file. Without a range, drive gain, damping, maximum steering
+    angle, yaw inertia and B and mu of the tyres lie within 30 % of their values (with kinematic only the first three
+    are uncertain). If the file states standard deviations (a diagnosis), its other numbers are exact."""
 
     method: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Method)) + "}")] = ARGUMENT_DEFAULT
     particles: Annotated[str | None, arg(metavar="{" + ",".join(get_args(Particles)) + "}")] = ARGUMENT_DEFAULT

@@ -48,12 +48,26 @@ def test_prior_ranges_contain_the_parameters_of_the_car(name: str) -> None:
 def test_kinematic_prior_has_no_effects_and_no_tyre_ranges() -> None:
     ranges = {"tyre.front.mu": (0.2, 1.1), "motor.drive_gain": (1.0, 50.0)}
     car = replace(SimulatorConfig(), effects={"steering_lag": {}}, priors=ranges)
-    assert prior_simulator(car, "nominal") == car, "the nominal prior is the car file"
     prior = prior_simulator(car, "kinematic")
     assert prior.effects == {}
     assert not [name for name in prior.priors if name.startswith("tyre")]
     assert prior.priors["motor.drive_gain"] == (1.0, 50.0)
     assert prior.priors["motor.damping"][1] == pytest.approx(1.3 * car.values()["motor.damping"])
+
+
+def test_nominal_prior_has_the_ranges_of_the_car_file_and_30_percent_for_other_uncertain_parameters() -> None:
+    ranges = {"tyre.front.mu": (0.2, 1.1), "vehicle.mass": (1.0, 2.0)}
+    car = replace(SimulatorConfig(), effects={"steering_lag": {}}, priors=ranges)
+    prior = prior_simulator(car, "nominal")
+    assert replace(prior, priors=ranges) == car
+    assert {name: prior.priors[name] for name in ranges} == ranges
+    assert prior.priors["tyre.rear.mu"] == pytest.approx(np.array([0.7, 1.3]) * car.values()["tyre.rear.mu"])
+    assert "vehicle.front_axle" not in prior.priors
+
+
+def test_nominal_prior_of_a_diagnosed_car_is_its_file() -> None:
+    car = replace(SimulatorConfig(), priors={}, parameter_std={"tyre.front.mu": 0.02})
+    assert prior_simulator(car, "nominal") == car
 
 
 def recording_of(ticks: int) -> EpisodeData:

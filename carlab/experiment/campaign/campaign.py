@@ -72,17 +72,18 @@ KINEMATIC_PARAMETERS = ("motor.drive_gain", "motor.damping", "steering.max_angle
 def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"]) -> SimulatorConfig:
     """Make the simulator of the prior: the car file's (nominal), or a kinematic one (no tyre slip).
 
-    Ranges are those of the car file. If the file has no range and no standard deviation, the ``UNCERTAIN_PARAMETERS``
-    have a range of ``PRIOR_HALF_WIDTH`` about their values.
+    Ranges are those of the car file. Of the ``UNCERTAIN_PARAMETERS``, those without a range have one of
+    ``PRIOR_HALF_WIDTH`` about their values. A file with standard deviations is the result of a diagnosis, whose other
+    numbers are exact.
     """
     values = car.values()
     if kind == "kinematic":
         ranges = {n: car.priors.get(n, _range_about(values[n])) for n in KINEMATIC_PARAMETERS}
         return replace(car, kind="kinematic", effects={}, priors=ranges, parameter_std={})
-    if car.priors or car.parameter_std:
+    if car.parameter_std:
         return car
     names = KINEMATIC_PARAMETERS if car.kind == "kinematic" else UNCERTAIN_PARAMETERS
-    return replace(car, priors={n: _range_about(values[n]) for n in names})
+    return replace(car, priors={**{n: _range_about(values[n]) for n in names}, **car.priors})
 
 
 def _range_about(value: float) -> tuple[float, float]:
