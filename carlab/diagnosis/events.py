@@ -133,7 +133,7 @@ def _grip_ratio(stretches: Sequence[_Stretch], car: CarParameters) -> float:
     held_mps2 = np.concatenate(held)
     if len(held_mps2) < EVENTS.min_moving_rows:
         return 1.0
-    return max(1.0, float(np.quantile(held_mps2, EVENTS.grip_quantile)) / float(grip_limits(car)[0]))
+    return max(1.0, float(np.quantile(held_mps2, EVENTS.usual_quantile)) / float(grip_limits(car)[0]))
 
 
 def _steady(changes: _Changes, width: int) -> FloatArray:

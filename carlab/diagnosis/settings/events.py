@@ -16,11 +16,10 @@ class EventSettings:
     """Minimum change of velocity and of yaw rate, over those that tyres with the grip of the car file cause in the same
     time. That grip is often a guess, and drive and side force add up in simulators without a friction ellipse: without
     an event, full braking in a curve with noise reaches 2.3 and 1.35."""
-    grip_quantile: float = 0.99
-    """Quantile of the steady accelerations of a recording that counts as its grip. If it is above the grip of the car
-    file, which may be too small, an event must also exceed ``grip_factors`` with the grip of the recording."""
     usual_quantile: float = 0.98
-    """Quantile of the changes of a recording that counts as usual driving: its hardest braking and steering."""
+    """Quantile of the changes of a recording that counts as usual driving: its hardest braking and steering. The same
+    quantile of its steady accelerations is its grip. If that is above the grip of the car file, which may be too small,
+    an event must also exceed ``grip_factors`` with the grip of the recording."""
     usual_factor: float = 1.45
     """Minimum change, over the usual one. The car may brake and drive with more than the grip of its car file."""
     noise_z: float = 6.0
