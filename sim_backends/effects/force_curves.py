@@ -13,9 +13,8 @@ from carlab.core.quantities import FloatArray
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import DynamicsEffect, Forces, Parameters
 from sim_backends.effects.curves import Axis, MeasuredCurve, front_slip_rad
+from sim_backends.effects.uncatalogued import REST_SPEED_MPS
 
-REST_SPEED_MPS = 0.2
-"""Speed over which a force over the slip angle builds up, so that a standing car gets none [m/s]."""
 _SPEED_AXES = (Axis("speed", "m/s", (-3.0, -1.5, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0), anchor=0.0),)
 _SLIP_AXES = (Axis("front slip angle", "rad", (-0.5, -0.3, -0.18, -0.1, -0.04, 0.0, 0.04, 0.1, 0.18, 0.3, 0.5)),)
 
@@ -67,7 +66,7 @@ class _OverSpeed(_ForceCurve):
 
 
 class _OverSlip(_ForceCurve):
-    """``a(slip) tanh(|vx| / 0.2 m/s)``, slip being that of the front wheels in the base model."""
+    """``a(slip) tanh(|vx| / 0.2 m/s)``, slip being that of the front wheels in the base model; zero at rest."""
 
     base_models = ("dynamic", "linear_tyre", "blend")
     class_statement = "a side force and a yaw moment that depend on the slip angle of the front wheels alone"
