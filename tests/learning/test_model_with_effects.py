@@ -16,6 +16,7 @@ from learning.transitions import transitions_of, velocity_delay_s
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.plant import Plant
+from tests.helpers.measured_rollout import measured_rollout
 
 QUIET = MocapParameters(latency_s=0.0)
 HISTORY = 8
@@ -86,15 +87,13 @@ def test_model_with_an_effect_predicts_rows_of_the_car_with_the_effect(name):
 
 
 def test_pose_dependent_effects_are_ignored():
-    """The declared pose-dependent effects are exactly those whose step depends on position or heading."""
-    from sim_backends.batch.rollout import rollout
-
+    """The declared pose-dependent effects are exactly those whose measured step depends on position or heading."""
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.1, 0.4], [0.7, -0.4, 1.1, 1.5, 0.1, 0.4]], dtype=torch.float64)
     sent = torch.tensor([[[0.4, 0.5]]], dtype=torch.float64).expand(2, 1, 2)
     found = set()
     for name in EFFECTS:
         config = SimulatorConfig(mocap=QUIET, effects={name: typical_parameters(name)})
-        velocities = rollout(config, start, sent).states[:, 1, 3:]
+        velocities = measured_rollout(config, start, sent).measured[:, -1, 3:]
         if not torch.allclose(velocities[0], velocities[1], atol=1e-9):
             found.add(name)
     assert found == POSE_DEPENDENT

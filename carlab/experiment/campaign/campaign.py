@@ -83,7 +83,8 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
     if car.parameter_std:
         return car
     names = KINEMATIC_PARAMETERS if car.kind == "kinematic" else UNCERTAIN_PARAMETERS
-    return replace(car, priors={**{n: _range_about(values[n]) for n in names}, **car.priors})
+    added = {n: _range_about(values[n]) for n in names if n not in car.priors}
+    return replace(car, priors={**car.priors, **added})
 
 
 def _range_about(value: float) -> tuple[float, float]:
