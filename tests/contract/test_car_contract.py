@@ -4,7 +4,7 @@ The emulated cars use the complete hardware path: sender process, bytes on a pty
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,7 @@ from carlab.core.car import Car
 from carlab.core.errors import (
     ActionOutOfRangeError,
     ActuatorFaultError,
+    CarlabError,
     NotArmedError,
     NotOpenError,
     NotReadyError,
@@ -58,7 +59,7 @@ def car(opened_car: Car) -> Iterator[Car]:
     if opened_car.reality is Reality.REAL:
         assert problems_after_waiting(opened_car) == ()
     opened_car.stop(planned=True)
-    opened_car.reset_fault()
+    reset_fault(opened_car)
 
 
 def problems_after_waiting(car: Car) -> tuple[str, ...]:
@@ -71,11 +72,21 @@ def problems_after_waiting(car: Car) -> tuple[str, ...]:
 
 def arm(car: Car) -> None:
     """Arm within five seconds; on a busy machine poses may be late, and the car refuses to arm."""
+    within_five_seconds(car, car.arm, NotReadyError)
+
+
+def reset_fault(car: Car) -> None:
+    """Reset within five seconds; on a busy machine an answer of the VESC may be late, and the fault stays."""
+    within_five_seconds(car, car.reset_fault, ActuatorFaultError)
+
+
+def within_five_seconds(car: Car, action: Callable[[], None], refusal: type[CarlabError]) -> None:
+    """Repeat an action while the car refuses it."""
     end_s = car.clock.now_s() + 5.0
     while True:
         try:
-            return car.arm()
-        except NotReadyError:
+            return action()
+        except refusal:
             if car.clock.now_s() > end_s:
                 raise
             wait(car, 0.05)
@@ -199,7 +210,7 @@ def test_a_planned_stop_disarms_and_an_unplanned_one_latches(car: Car) -> None:
         car.command(Action(0.1, 0.0))
     with pytest.raises(ActuatorFaultError):
         car.arm()
-    car.reset_fault()
+    reset_fault(car)
     with pytest.raises(NotArmedError):
         car.command(Action(0.1, 0.0))
     arm(car)
