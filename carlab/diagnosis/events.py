@@ -121,7 +121,7 @@ def grip_limits(car: CarParameters) -> FloatArray:
 def _grip_ratio(stretches: Sequence[_Stretch], car: CarParameters) -> float:
     """Grip that the recording shows over that of the car file, at least 1.
 
-    The recording shows the accelerations that the car holds for several rows. A collision is shorter.
+    The recording shows the accelerations that the car sustains for several rows. A collision is shorter.
     """
     held = []
     for stretch in stretches:

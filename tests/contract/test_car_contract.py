@@ -76,7 +76,7 @@ def arm(car: Car) -> None:
 
 
 def reset_fault(car: Car) -> None:
-    """Reset within five seconds; on a busy machine an answer of the VESC may be late, and the fault stays."""
+    """Reset within five seconds; on a busy machine an answer of the VESC may be late, and the reset is refused."""
     within_five_seconds(car, car.reset_fault, ActuatorFaultError)
 
 

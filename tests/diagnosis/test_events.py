@@ -75,7 +75,7 @@ def _with_grip(config: SimulatorConfig, factor: float) -> SimulatorConfig:
 @pytest.mark.parametrize("factor", [0.2, 0.33, 0.6])
 @pytest.mark.parametrize(("kind", "seed"), [("", 11), ("", 12), ("effect", 46), ("blow", 1), ("turn", 3)])
 def test_a_small_grip_in_the_car_file_adds_no_events(kind: str, seed: int, factor: float) -> None:
-    """The car holds accelerations that its car file does not allow, so they are no events."""
+    """The car sustains accelerations that its car file does not allow, so they are no events."""
     driven = event_drive(seed, kind)
     found = find_events(driven.episode, _with_grip(driven.config, factor))
     assert driven.missed_and_false(found) == (0, 0)

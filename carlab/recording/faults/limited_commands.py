@@ -30,7 +30,7 @@ AT_LIMIT_SHARE = 0.8
 """Share of the averaged and delayed command that is at the limit in the rows that are compared."""
 COVERED_SPEEDS = 0.05
 """Share of the fitted rows on either side whose speeds do not count as covered."""
-NEARLY_LIMIT_SHARE, MIN_NEARLY_ROWS = 0.65, 10
+CLOSE_LIMIT_SHARE, MIN_CLOSE_ROWS = 0.65, 10
 """The limit is covered if at least this number of fitted rows has a command above this share of the limit."""
 
 
@@ -112,7 +112,7 @@ def _excess(
 
 
 def _is_covered(command: FloatArray, vx: FloatArray, is_free: BoolArray) -> BoolArray:
-    """Rows (n,) whose command and speed the rows ``is_free`` (n,) cover, so that their fit holds there.
+    """Rows (n,) whose command and speed the rows ``is_free`` (n,) cover, so that their fit is valid there.
 
     Commands of a log that is limited go up to the limit. A driver with a few fixed commands has a gap below it.
     """
@@ -120,7 +120,7 @@ def _is_covered(command: FloatArray, vx: FloatArray, is_free: BoolArray) -> Bool
     found = (vx >= slowest) & (vx <= fastest)
     for side in (1.0, -1.0):
         size = side * command
-        nearly = is_free & (size > NEARLY_LIMIT_SHARE * size.max())
-        if nearly.sum() < MIN_NEARLY_ROWS:
+        is_close = is_free & (size > CLOSE_LIMIT_SHARE * size.max())
+        if is_close.sum() < MIN_CLOSE_ROWS:
             found &= size <= 0.0
     return np.asarray(found)
