@@ -123,17 +123,17 @@ def _grip_ratio(stretches: Sequence[_Stretch], car: CarParameters) -> float:
 
     The recording shows the accelerations that the car sustains for several rows. A collision is shorter.
     """
-    held = []
+    sustained = []
     for stretch in stretches:
         width = stretch.rows_of(EVENTS.widths_s[0])
         changes = stretch.changes(width, 0)
         is_moving = np.isfinite(changes.elapsed_s) & (stretch.speed_mps > EVENTS.moving_mps)
         steady = _steady(changes, width)[is_moving]
-        held.append(np.hypot(steady[:, 0], steady[:, 1]) / changes.elapsed_s[is_moving])
-    held_mps2 = np.concatenate(held)
-    if len(held_mps2) < EVENTS.min_moving_rows:
+        sustained.append(np.hypot(steady[:, 0], steady[:, 1]) / changes.elapsed_s[is_moving])
+    sustained_mps2 = np.concatenate(sustained)
+    if len(sustained_mps2) < EVENTS.min_moving_rows:
         return 1.0
-    return max(1.0, float(np.quantile(held_mps2, EVENTS.usual_quantile)) / float(grip_limits(car)[0]))
+    return max(1.0, float(np.quantile(sustained_mps2, EVENTS.usual_quantile)) / float(grip_limits(car)[0]))
 
 
 def _steady(changes: _Changes, width: int) -> FloatArray:

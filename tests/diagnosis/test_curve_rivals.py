@@ -41,40 +41,39 @@ def wavy(throttle: FloatArray) -> FloatArray:
     return np.asarray(throttle + 0.06 * np.sin(2.0 * np.pi * throttle / 0.25))
 
 
-class WavyThrottle(ActuatorEffect):
+class Wave:
+    """Texts of physics outside the catalogue."""
+
+    catalogued = False
+    summary = "A wave."
+    class_statement = "a wave"
+
+
+class WavyThrottle(Wave, ActuatorEffect):
     """``u = u_t + size sin(2 pi u_t / 0.25)``."""
 
     id = "wavy_throttle"
-    catalogued = False
     command = "throttle"
-    summary = "The throttle at the motor is a wave over its command."
-    class_statement = "a wave"
     parameters = (EffectParameter("size", "1", 0.0, -1.0, 1.0, 0.06),)
 
     def apply(self, ops: Ops, command: Value, values: Mapping[str, Value]) -> Value:
         return command + values["size"] * ops.sin(command * (2.0 * np.pi / 0.25))
 
 
-class WavyMoment(DynamicsEffect):
+class WavyMoment(Wave, DynamicsEffect):
     """``M += size sin(2 pi vx / 4 m/s)``."""
 
     id = "wavy_moment"
-    catalogued = False
-    summary = "A yaw moment is a wave over the speed."
-    class_statement = "a wave"
     parameters = (EffectParameter("size", "N m", 0.0, -1.0, 1.0, 0.1),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Mapping[str, Value]) -> None:
         forces.moment = forces.moment + values["size"] * ops.sin(forces.vx * (0.5 * np.pi))
 
 
-class WavyForce(DynamicsEffect):
+class WavyForce(Wave, DynamicsEffect):
     """``F_y += size cos(pi slip / 0.4 rad)``, slip being that of the front wheels."""
 
     id = "wavy_force"
-    catalogued = False
-    summary = "A side force is a wave over the slip angle."
-    class_statement = "a wave"
     parameters = (EffectParameter("size", "N", 0.0, -5.0, 5.0, 0.5),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Mapping[str, Value]) -> None:
@@ -83,13 +82,10 @@ class WavyForce(DynamicsEffect):
         forces.force_y = forces.force_y + values["size"] * wave
 
 
-class WavyHeading(ObservationEffect):
+class WavyHeading(Wave, ObservationEffect):
     """``yaw_meas = yaw + size (1 + sin(2 yaw + 1))``, with velocities in the measured axes."""
 
     id = "wavy_heading"
-    catalogued = False
-    summary = "The error of the heading is a wave over the heading."
-    class_statement = "a wave"
     parameters = (EffectParameter("size", "rad", 0.0, -0.3, 0.3, 0.02),)
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Mapping[str, Value]) -> tuple[Value, ...]:

@@ -20,16 +20,6 @@ X, Y, YAW, VX, VY, RATE = range(6)
 
 
 @pytest.fixture(scope="module")
-def clean() -> EpisodeData:
-    return Car().drive()
-
-
-@pytest.fixture(scope="module")
-def held() -> EpisodeData:
-    return Car(seed=1, seconds=40.0).drive()
-
-
-@pytest.fixture(scope="module")
 def circling() -> EpisodeData:
     return Car(seed=2, mean_steering=0.4).drive()
 

@@ -15,16 +15,6 @@ from tests.helpers.kinematic_drives import NOMINAL, Car, with_sent, with_states,
 VX, VY = 3, 4
 
 
-@pytest.fixture(scope="module")
-def clean() -> EpisodeData:
-    return Car().drive()
-
-
-@pytest.fixture(scope="module")
-def held() -> EpisodeData:
-    return Car(seed=1, seconds=40.0).drive()
-
-
 def exchange(sent: np.ndarray) -> None:
     sent[:] = sent[:, ::-1].copy()
 

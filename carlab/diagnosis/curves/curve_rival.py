@@ -3,10 +3,10 @@
 A map of a command contains the named effects of this command as special cases, so it fits about as well if one of them
 is the physics; so does an error of the heading over the heading, which contains a yaw misalignment. A side force and a
 yaw moment over the speed or the slip angle do not contain all effects that turn the car to one side; if one of these is
-the physics, they fit about as well or worse. The curve replaces the named effects if it lowers the
-error on left-out blocks significantly, by a relevant share of its own gain over the refit. The residual is then
-described by the class of the curve. The initial states of the windows are free, because their errors hide most of the
-difference (``identification.free_initial_states``).
+the physics, they fit about as well or worse. The curve replaces the named effects if it lowers the error on left-out
+blocks significantly, by a relevant share of its own gain over the refit. The residual is then described by the class of
+the curve. The initial states of the windows are free, because their errors hide most of the difference
+(``identification.free_initial_states``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 class RivalCurve:
     """A measured curve of one dimension, whose fit takes seconds.
 
-    curve       id of the curve, or of a sum of waves
+    curve       id of the measured curve, or of ``HeadingError``, a Fourier series
     additional  effects and further curves that are fitted with it
     replaced    effects that it replaces in addition to those with this curve in ``represented_by``
     """
