@@ -21,6 +21,7 @@ from carlab.diagnosis.state_alignment import align_states, window_variance_s2
 from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.mcap.source import read_episode
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS
 
 SIMULATOR = SimulatorConfig.from_preset()
 
@@ -67,8 +68,8 @@ def test_concealed_effect_of_an_independent_generator_is_located_and_named(effec
         assert found.value == pytest.approx(value, rel=0.15, abs=0.002)
     assert first.share > 0.9
     assert not first.with_refit
-    assert effect in sentences(check)[1]
-    assert effect in short(check)
+    assert f"Most likely cause: {EFFECTS[effect].name} ({effect}: " in sentences(check)[1]
+    assert short(check).endswith(f"likely cause: {EFFECTS[effect].name}")
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from carlab.diagnosis.quick.causes import ALL_PARAMETERS, GRIP, Cause
 from carlab.diagnosis.quick.quick_check import QuickCheck
 from carlab.diagnosis.report.numbers import number, percent, with_unit
 from carlab.diagnosis.report.sentences import CHANNEL_NAMES
+from sim_backends.effects import EFFECTS
 
 
 def sentences(check: QuickCheck, decide: str = "carlab diagnose decides") -> tuple[str, ...]:
@@ -47,7 +48,7 @@ def short(check: QuickCheck) -> str:
         return "the simulator: undecided"
     if check.verdict == "explains":
         return f"the simulator explains the recordings ({check.score:.1f} noise floors)"
-    cause = f"; likely cause: {check.causes[0].id}" if check.causes else ""
+    cause = f"; likely cause: {_name(check.causes[0].id)}" if check.causes else ""
     worst = check.channels[0].channel
     return f"the simulator does not explain the recordings ({check.score:.1f} noise floors, {worst}){cause}"
 
@@ -67,7 +68,6 @@ def _likely_causes(check: QuickCheck, decide: str) -> str:
 
 
 def _cause(cause: Cause) -> str:
-    name = {ALL_PARAMETERS: "the parameters of the car file", GRIP: "the grip of both axles"}.get(cause.id, cause.id)
     values = []
     for key, p in cause.parameters.items():
         label = key if cause.id in (ALL_PARAMETERS, GRIP) else key.rsplit(".", 1)[1]
@@ -76,4 +76,12 @@ def _cause(cause: Cause) -> str:
             text += f" instead of {number(p.before)}"
         values.append(text)
     refit = " with other parameters of the car file" if cause.with_refit else ""
-    return f"{name} ({', '.join(values)}){refit}"
+    id_of_effect = f"{cause.id}: " if cause.id in EFFECTS else ""
+    return f"{_name(cause.id)} ({id_of_effect}{', '.join(values)}){refit}"
+
+
+def _name(cause: str) -> str:
+    """Name of a cause by its id; a base parameter has its dotted name."""
+    if cause in EFFECTS:
+        return EFFECTS[cause].name
+    return {ALL_PARAMETERS: "the parameters of the car file", GRIP: "the grip of both axles"}.get(cause, cause)
