@@ -302,6 +302,7 @@ class TestCorrelatedErrors:
 
         The counts are the batch size of the optimiser and twice that.
         """
+        monkeypatch.setattr(discrepancy, "STEPS", ALL_STEPS)
         correlation = 0.98
         mutual_information = -0.5 * math.log(1.0 - correlation**2)
         gain, prediction = self.density_gain(monkeypatch, Linear(), correlation, count)

@@ -194,7 +194,7 @@ def test_gradients_equal_finite_differences_for_each_number(kind):
     leaves = [t.clone().requires_grad_() for t in inputs]
     losses(*leaves).sum().backward()
     # Each pair of cars in the batch has one entry of one input increased or decreased.
-    rng, step = np.random.default_rng(1), 1e-6
+    rng, step = np.random.default_rng(1), 1e-7  # the wheel inertia is 1e-3, so 1e-6 is too coarse
     perturbed = [t[:1].repeat(2 * len(inputs), *[1] * (t.ndim - 1)) for t in inputs]
     places = [int(rng.integers(t[0].numel())) for t in inputs]
     for index, place in enumerate(places):
