@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,8 +14,12 @@ class CanFrame:
     data: bytes
 
 
-class ByteLink(Protocol):
-    """A byte stream. Constructing does nothing. Every failure after ``open`` is an ActuatorFaultError."""
+Written = TypeVar("Written", contravariant=True)
+Read = TypeVar("Read", covariant=True)
+
+
+class Link(Protocol[Written, Read]):
+    """A link. Constructing does nothing. Every failure after ``open`` is an ActuatorFaultError."""
 
     @property
     def opens(self) -> int:
@@ -24,37 +28,20 @@ class ByteLink(Protocol):
     def open(self) -> None:
         """Connect. Raises NotReadyError with the remedy."""
 
-    def write(self, data: bytes) -> None:
-        """Write all bytes within the write time-out, or raise; unsent bytes are discarded."""
+    def write(self, item: Written, /) -> None:
+        """Send all bytes within the write time-out (unsent ones are discarded), or a frame at once; else raise."""
 
-    def read(self) -> bytes:
-        """Bytes that have arrived; may be empty. Never blocks."""
+    def read(self) -> Read:
+        """Bytes (may be empty) or frames that have arrived, oldest first. Never blocks."""
 
     def fileno(self) -> int | None:
-        """File descriptor that becomes readable when bytes arrive; None if there is none."""
+        """File descriptor that becomes readable when bytes or frames arrive; None if there is none."""
 
     def close(self) -> None:
         """Disconnect in bounded time. Idempotent; safe after a failure."""
 
 
-class FrameLink(Protocol):
-    """A frame bus, otherwise like ``ByteLink``."""
-
-    @property
-    def opens(self) -> int:
-        """Number of openings since construction."""
-
-    def open(self) -> None:
-        """Connect. Raises NotReadyError with the remedy."""
-
-    def write(self, frame: CanFrame) -> None:
-        """Send a frame at once or raise, without a queue of this program."""
-
-    def read(self) -> list[CanFrame]:
-        """Frames that have arrived, oldest first. Never blocks."""
-
-    def fileno(self) -> int | None:
-        """File descriptor that becomes readable when frames arrive; None if there is none."""
-
-    def close(self) -> None:
-        """Disconnect in bounded time. Idempotent; safe after a failure."""
+ByteLink = Link[bytes, bytes]
+"""A byte stream."""
+FrameLink = Link[CanFrame, list[CanFrame]]
+"""A frame bus, without a queue of this program."""
