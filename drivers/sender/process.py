@@ -18,8 +18,8 @@ import socket
 import subprocess
 import sys
 import threading
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Protocol
 
 from carlab.core.tables import from_table
 from drivers.calibration import ActuatorCalibration
@@ -36,33 +36,8 @@ MAX_ERROR_CHARACTERS = 300
 """Largest part of the last line of the sender's error output in a message."""
 
 
-class Sender(Protocol):
-    """Interface of a started sender in the main process."""
-
-    def post(self, order: Order) -> None:
-        """Publish the newest order and wake the sender; never blocks."""
-
-    def status(self) -> SenderStatus:
-        """The newest status; never blocks."""
-
-    def is_alive(self) -> bool:
-        """Whether the sender still runs."""
-
-    def ending(self) -> str:
-        """How the sender ended, such as "ended with status 1"; empty while it runs."""
-
-    def processor_time_s(self) -> float:
-        """Processor time that the sender has used [s]; NaN if it is unknown."""
-
-    def join(self, timeout_s: float) -> bool:
-        """Wait for the sender to end; returns whether it has ended."""
-
-    def close(self) -> None:
-        """Close the wake line (the sender sends neutral and ends), wait for a bounded time, and free all resources."""
-
-
-class _StartedSender:
-    """Slots and wake line of a sender, on the side of the main process."""
+class Sender(ABC):
+    """A started sender, on the side of the main process: its slots and wake line, and how to end it."""
 
     def __init__(self) -> None:
         self.orders = Slot.create(ORDER_SIZE)
@@ -72,18 +47,44 @@ class _StartedSender:
         self._last = SenderStatus()
 
     def post(self, order: Order) -> None:
-        """Write the order, then wake the sender; errors are ignored here since the status shows an ended sender."""
+        """Publish the newest order and wake the sender; never blocks.
+
+        Errors are ignored, since the status shows an ended sender.
+        """
         with contextlib.suppress(OSError, ValueError):
             self.orders.write(order.pack())
             self.wake.send(b"\1")
 
     def status(self) -> SenderStatus:
-        """Newest status; the last one read if the slot is being written or another thread has closed it."""
+        """Newest status; the last one read if the slot is being written or another thread has closed it.
+
+        Never blocks.
+        """
         with contextlib.suppress(ValueError):
             newest = self.statuses.read()
             if newest is not None:
                 self._last = SenderStatus.unpack(newest[1])
         return self._last
+
+    @abstractmethod
+    def is_alive(self) -> bool:
+        """Whether the sender still runs."""
+
+    @abstractmethod
+    def ending(self) -> str:
+        """How the sender ended, such as "ended with status 1"; empty while it runs."""
+
+    @abstractmethod
+    def processor_time_s(self) -> float:
+        """Processor time that the sender has used [s]; NaN if it is unknown."""
+
+    @abstractmethod
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the sender to end; returns whether it has ended."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the wake line (the sender sends neutral and ends), wait for a bounded time, and free all resources."""
 
     def _free(self) -> None:
         self.wake.close()
@@ -123,7 +124,7 @@ class ErrorOutput:
         return os.pread(self.descriptor, os.fstat(self.descriptor).st_size, 0).decode("utf-8", "replace")
 
 
-class SenderProcess(_StartedSender):
+class SenderProcess(Sender):
     """The sender's process, started on construction; ``Actuator`` owns and closes it."""
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> None:
@@ -200,7 +201,7 @@ class SenderProcess(_StartedSender):
         self._errors.close()
 
 
-class SenderThread(_StartedSender):
+class SenderThread(Sender):
     """The sender as a thread, for buses that exist only within one process (python-can's ``virtual``)."""
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration, device: Device | None = None) -> None:
