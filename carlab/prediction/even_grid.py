@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.recording.faults.robust import held_means
 
 MAX_JITTER_SHARE, MAX_JITTER_S = 0.2, 1e-3
 """Maximum deviation of the time between rows from its mean, share or [s]: jitter, or stamps in whole milliseconds."""
@@ -61,12 +62,4 @@ def part_deviations(t: FloatArray, held: FloatArray, grid: FloatArray, period_s:
 
 def cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:
     """Mean over [grid, grid + period) of values held from each t on."""
-    integral = np.vstack([np.zeros(2), np.cumsum(held[:-1] * np.diff(t)[:, None], axis=0)])
-
-    def integral_to(moments: FloatArray) -> FloatArray:
-        inside = np.clip(moments, t[0], t[-1])
-        index = np.clip(np.searchsorted(t, inside, side="right") - 1, 0, len(t) - 1)
-        past = np.clip(moments - t[-1], 0.0, None)[:, None] * held[-1]
-        return np.asarray(integral[index] + (inside - t[index])[:, None] * held[index] + past)
-
-    return (integral_to(grid + period_s) - integral_to(grid)) / period_s
+    return np.stack([held_means(t, column, grid, period_s) for column in held.T], axis=1)
