@@ -90,8 +90,8 @@ class ServerInfo(NamedTuple):
         return BitstreamVersion(*self.natnet_version[:2])
 
 
-def _text(data: bytes) -> str:
-    """Text up to the first NUL; Motive sends garbage after it."""
+def decode_text(data: bytes) -> str:
+    """Text of a name, REQUEST, MESSAGESTRING or RESPONSE, up to the first NUL; Motive sends garbage after it."""
     return data.partition(b"\0")[0].decode("utf-8", "replace")
 
 
@@ -135,7 +135,7 @@ def decode_connect(payload: bytes) -> Connect:
     if len(payload) >= CONNECT_BYTES and any(payload[265:269]):
         bitstream = BitstreamVersion(payload[265], payload[266])
     subscribed_only = len(payload) >= CONNECT_BYTES and payload[264] != 0
-    return Connect(_text(payload[:NAME_BYTES]), app_version, natnet_version, bitstream, subscribed_only)
+    return Connect(decode_text(payload[:NAME_BYTES]), app_version, natnet_version, bitstream, subscribed_only)
 
 
 def encode_server_info(info: ServerInfo) -> bytes:
@@ -151,7 +151,7 @@ def decode_server_info(payload: bytes) -> ServerInfo:
         raise ProtocolError(
             f"NatNet server info ends at byte {len(payload)}, in the name and versions of {SENDER_BYTES} bytes."
         )
-    sender = _text(payload[:NAME_BYTES]), _four(payload[256:260]), _four(payload[260:264])
+    sender = decode_text(payload[:NAME_BYTES]), _four(payload[256:260]), _four(payload[260:264])
     if len(payload) == SENDER_BYTES:
         return ServerInfo(*sender)
     if len(payload) < SERVERINFO_BYTES:
@@ -167,11 +167,6 @@ def decode_server_info(payload: bytes) -> ServerInfo:
 def encode_request(command: str) -> bytes:
     """Payload of REQUEST: the command and a NUL."""
     return command.encode("utf-8") + b"\0"
-
-
-def decode_text(payload: bytes) -> str:
-    """Text of REQUEST, MESSAGESTRING or RESPONSE, up to the first NUL."""
-    return _text(payload)
 
 
 def decode_integer_response(payload: bytes) -> int | None:
