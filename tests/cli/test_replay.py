@@ -1,30 +1,22 @@
 """``carlab replay`` on a simulated car: errors by part and channel, the overlay in rerun, and refusals."""
 
-import math
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
+from tests.cli.test_bad_input import canonical_csv, write
 from tests.helpers.command_line import Carlab
 
-HEADER = "t,x,y,yaw,vx,vy,yaw_rate,steering,throttle"
 
-
-def circle(path: Path, seconds: float, offset_s: float = 0.0) -> Path:
+def circle(folder: Path, seconds: float) -> Path:
     """Write an exact circle at 1 m/s as CSV."""
-    t = offset_s + np.arange(round(30 * seconds)) / 30.0
-    yaw = 0.8 * t
-    columns = [t, np.sin(yaw) / 0.8, (1 - np.cos(yaw)) / 0.8, (yaw + math.pi) % (2 * math.pi) - math.pi]
-    columns += [np.ones(len(t)), np.zeros(len(t)), np.full(len(t), 0.8), np.full(len(t), 0.4), 0.3 + 0.01 * np.sin(t)]
-    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=HEADER, comments="")
-    return path
+    return write(*canonical_csv(folder, rows=round(30 * seconds)))
 
 
 def test_both_parts_and_all_channels_are_compared_with_constant_velocity(carlab: Carlab, tmp_path: Path) -> None:
     """The constant-velocity prediction is exact on a circle; the default car drives another circle."""
-    code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), "--save", tmp_path / "drive.rrd")
+    code, text = carlab("replay", circle(tmp_path, 30.0), "--save", tmp_path / "drive.rrd")
     assert code == 0
     assert "whole recording (107 windows from 0.6 to 29.9 s)" in text
     assert "last 30 % (" in text
@@ -35,14 +27,14 @@ def test_both_parts_and_all_channels_are_compared_with_constant_velocity(carlab:
 
 
 def test_short_recording_is_scored_as_a_whole(carlab: Carlab, tmp_path: Path) -> None:
-    code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0))
+    code, text = carlab("replay", circle(tmp_path, 5.0))
     assert code == 0
     assert "whole recording (" in text
     assert "The last part is too short to be scored by itself." in text
 
 
 def test_given_holdout_share_and_horizon_are_used(carlab: Carlab, tmp_path: Path) -> None:
-    path = circle(tmp_path / "drive.csv", 30.0)
+    path = circle(tmp_path, 30.0)
     code, text = carlab("replay", path, "--holdout-share", "0.5", "--horizon", "0.5", "--stride", "0.5")
     assert code == 0
     assert "Error after 0.50 s, last 50 % (" in text
@@ -60,14 +52,14 @@ def test_given_holdout_share_and_horizon_are_used(carlab: Carlab, tmp_path: Path
 def test_invalid_options_are_refused_in_one_sentence(
     carlab: Carlab, tmp_path: Path, options: tuple[str, ...], message: str
 ) -> None:
-    code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), *options)
+    code, text = carlab("replay", circle(tmp_path, 30.0), *options)
     assert code != 0
     assert message in text
 
 
 def test_adaptation_to_a_car_that_turns_more_than_its_simulator_is_printed(carlab: Carlab, tmp_path: Path) -> None:
     """The default car does not drive this circle; an adapted one predicts it several times better."""
-    path = circle(tmp_path / "drive.csv", 30.0)
+    path = circle(tmp_path, 30.0)
     code, text = carlab("replay", path, "--adapt")
     assert code == 0
     last_part = text[text.index("last 30 %") :]
@@ -87,7 +79,7 @@ def test_adaptation_to_a_car_that_turns_more_than_its_simulator_is_printed(carla
 def test_difference_is_printed_only_at_times_that_the_drive_reached(
     carlab: Carlab, tmp_path: Path, seconds: str, columns: str
 ) -> None:
-    path = circle(tmp_path / "drive.csv", 5.0)
+    path = circle(tmp_path, 5.0)
     code, text = carlab("replay", path, "--drive", "--seconds", seconds, "--out", tmp_path / "runs")
     assert code == 0
     assert columns in " ".join(re.sub(r"[^\w.() \[\]/]", " ", text).split())

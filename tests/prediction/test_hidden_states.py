@@ -10,35 +10,16 @@ from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import CarParameters, SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
+from tests.helpers.reference_dynamics import reference_rates
 
 PARAMETERS = CarParameters()
 PERIOD_S = 1 / 30
 
 
-def rates(s, angle, drive_n, length_m, p=PARAMETERS):
+def rates(s, angle, throttle, length_m):
     """Evaluate the single-track model; the last two states are the side forces, which relax over ``length_m``."""
-    yaw, vx, vy, r, front, rear = s[2:]
-    load = p.mass_kg * 9.81 / (p.front_axle_m + p.rear_axle_m)
-    across = -vx * np.sin(angle) + (vy + p.front_axle_m * r) * np.cos(angle)
-    along = vx * np.cos(angle) + (vy + p.front_axle_m * r) * np.sin(angle)
-    steady = [
-        -mu * load * arm * np.sin(c * np.arctan(b * np.arctan2(side, max(abs(forward), 0.3))))
-        for mu, arm, c, b, side, forward in (
-            (p.front_mu, p.rear_axle_m, p.front_c, p.front_b, across, along),
-            (p.rear_mu, p.front_axle_m, p.rear_c, p.rear_b, vy - p.rear_axle_m * r, vx),
-        )
-    ]
-    rate = max(abs(vx), 0.3) / length_m
-    return [
-        vx * np.cos(yaw) - vy * np.sin(yaw),
-        vx * np.sin(yaw) + vy * np.cos(yaw),
-        r,
-        (drive_n - p.damping_nspm * vx - front * np.sin(angle)) / p.mass_kg + vy * r,
-        (rear + front * np.cos(angle)) / p.mass_kg - vx * r,
-        (p.front_axle_m * front * np.cos(angle) - p.rear_axle_m * rear) / p.yaw_inertia_kgm2,
-        rate * (steady[0] - front),
-        rate * (steady[1] - rear),
-    ]
+    relaxation = {"tyre_relaxation": {"length": length_m}}
+    return reference_rates(0.0, [*s, *np.zeros(3)], angle, throttle, PARAMETERS, relaxation)[:8]
 
 
 def with_play(angles, play):
@@ -58,7 +39,7 @@ def drive(steering_of_time, length_m, play=0.0, seconds=12.0):
     state = np.array([0.0, 0.0, 0.5, 2.0, 0.0, 0.0, 0.0, 0.0])
     states = [state[:6]]
     for angle, throttle in zip(angles, sent[:, 1], strict=True):
-        held = (angle, PARAMETERS.drive_gain_n * throttle, length_m)
+        held = (angle, throttle, length_m)
         state = solve_ivp(lambda _, s, h=held: rates(s, *h), (0.0, PERIOD_S), state, rtol=1e-9, atol=1e-11).y[:, -1]
         states.append(state[:6])
     times_s = PERIOD_S * np.arange(len(states))

