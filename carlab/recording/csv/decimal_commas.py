@@ -10,6 +10,15 @@ _THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2},\d{3}\s*")
 """A number that is 1000 times larger if the comma separates thousands: 1,234."""
 
 
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number, if it has a fraction with a decimal point."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
 def has_decimal_comma(cell: str) -> bool:
     """Whether a cell is a number if its comma is the decimal separator."""
     return _NUMBER.fullmatch(cell) is not None
@@ -36,10 +45,4 @@ def with_decimal_points(texts: Mapping[str, Sequence[str]], numbers: Iterable[Se
 
 
 def _is_whole_or_has_comma(cell: str) -> bool:
-    if has_decimal_comma(cell):
-        return True
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return "." not in cell
+    return has_decimal_comma(cell) or (is_number(cell) and "." not in cell)

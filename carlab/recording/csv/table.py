@@ -13,7 +13,7 @@ import numpy as np
 
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.recording.csv.decimal_commas import has_decimal_comma, with_decimal_points
+from carlab.recording.csv.decimal_commas import has_decimal_comma, is_number, with_decimal_points
 
 _MISSING = frozenset({"", "none", "null", "na", "n/a"})
 
@@ -41,7 +41,7 @@ class ColumnTable:
         """Return a numeric column (N,). Raises DataError if it holds text."""
         if name in self.texts:
             row, cell = self.texts[name]
-            is_ambiguous = "," in cell and _is_number(cell.replace(".", "").replace(",", ""))
+            is_ambiguous = "," in cell and is_number(cell.replace(".", "").replace(",", ""))
             remedy = "write the column as numbers (a date as seconds)" if row == 1 else "correct or empty that cell"
             if is_ambiguous:
                 remedy = "write all numbers with a decimal point and without separators of thousands"
@@ -76,7 +76,7 @@ def read_csv(path: Path | str) -> ColumnTable:
     if not lines:
         raise DataError(f"{path.name} is empty; a recording has a header and at least three rows.")
     header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
-    if all(_is_number(cell) or has_decimal_comma(cell) for cell in header):
+    if all(is_number(cell) or has_decimal_comma(cell) for cell in header):
         raise DataError(f"{path.name} begins with numbers; add a header line with the column names.")
     if len(header) == 1:
         raise DataError(
@@ -124,7 +124,7 @@ def _numbers(cells: list[str]) -> FloatArray | None:
 
 def _first_text(cells: list[str]) -> tuple[int, str]:
     """Row and content of the first cell that is not a number."""
-    index = next(k for k, cell in enumerate(cells) if not _is_number(cell))
+    index = next(k for k, cell in enumerate(cells) if not is_number(cell))
     return index + 1, cells[index]
 
 
@@ -159,11 +159,3 @@ def _read_text(path: Path) -> str:
         ) from error
     except OSError as error:
         raise DataError(f"Cannot read {path}: {error.strerror}; check the path.") from error
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
