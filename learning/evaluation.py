@@ -67,7 +67,8 @@ class Mixture:
         factor: Tensor = inverse * self.stds[..., None, :] @ torch.linalg.cholesky_ex(self.correlation).L
         return factor.square().sum(dim=-1).sqrt()
 
-    def _decorrelate(self, errors: Tensor) -> Tensor:
+    def decorrelated(self, errors: Tensor) -> Tensor:
+        """Errors (..., O) of raw outputs as those of the decorrelated outputs."""
         return errors if self.decorrelation is None else errors @ self.decorrelation.T
 
     @property
@@ -90,7 +91,7 @@ class Mixture:
         """
         shrink = math.sqrt(1.0 - bandwidth**2)
         deviation = self.means - self.mean
-        spread = bandwidth * self._decorrelate(deviation).std(dim=0, correction=0)
+        spread = bandwidth * self.decorrelated(deviation).std(dim=0, correction=0)
         return replace(self, means=self.mean + shrink * deviation, stds=(self.stds**2 + spread**2).sqrt())
 
     def gaussians(self, each: int = 20) -> Mixture:
@@ -112,7 +113,7 @@ class Mixture:
 
     def log_density(self, targets: Tensor) -> Tensor:
         """Joint log density (N,) of targets (N, O)."""
-        white = self._decorrelate(targets - self.means) / self.stds
+        white = self.decorrelated(targets - self.means) / self.stds
         log_volume = self.stds.log().expand_as(self.means).sum(dim=2)
         if self.correlation is None:
             square = (white**2).sum(dim=2)

@@ -54,20 +54,16 @@ class Ensemble:
         components = self.networks.predict(inputs)
         if self.noise_std is None or self.residuals is None:
             return components.smoothed()
-        disagreement = self._decorrelate(components.means).var(dim=0)
-        std = (self.noise_std**2 + self.disagreement_weight * disagreement).sqrt() * self.residuals.scale
+        disagreement = components.decorrelated(components.means).var(dim=0)
         scale = self.residuals.scale
+        std = (self.noise_std**2 + self.disagreement_weight * disagreement).sqrt() * scale
         correlation = self.residuals.factor @ self.residuals.factor.T / (scale[:, None] * scale)
-        decorrelation = self.networks.normaliser.error_decorrelation
-        return Mixture(components.mean[None], std[None], self.residuals.dof, decorrelation, correlation)
+        return Mixture(components.mean[None], std[None], self.residuals.dof, components.decorrelation, correlation)
 
     def errors(self, inputs: Tensor, outputs: Tensor) -> Tensor:
         """Decorrelated errors (L, n, O) of the networks at raw rows of (n, D) and (n, O), double precision."""
-        return self._decorrelate(outputs - self.networks.predict(inputs).means).double()
-
-    def _decorrelate(self, errors: Tensor) -> Tensor:
-        decorrelation = self.networks.normaliser.error_decorrelation
-        return errors if decorrelation is None else errors @ decorrelation.T
+        components = self.networks.predict(inputs)
+        return components.decorrelated(outputs - components.means).double()
 
 
 def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, settings: FsvgdSettings) -> Ensemble:
