@@ -120,7 +120,7 @@ def prediction_speed(device: str = "cpu") -> dict[str, Any]:
         ours_s = _seconds(lambda: network(numbers, inputs), device)
         product_s = _seconds(lambda: left @ right, device)
     whole_s = _seconds(lambda: posterior.predict(inputs), device)
-    drawn_s = _seconds(lambda: car.sample(inputs, generator), device)
+    drawn_s = _seconds(lambda: car.sampler(inputs, generator), device)
     return {
         "batch_ms": 1e3 * ours_s,
         "matrix_product_ms": 1e3 * product_s,

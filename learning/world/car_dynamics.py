@@ -43,13 +43,9 @@ class CarDynamics(StatelessModel):
         """Predictive distribution of changes at inputs (N, 3 + 2 (H + 1))."""
         return self.posterior.predict(inputs)
 
-    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """One sample (N, 6) of the mixture for each row of inputs (N, 3 + 2 (H + 1))."""
-        return self.sampler(inputs, generator)
-
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """Features (N, 7 + 2 H) one step after ``action`` (N, 2)."""
-        return advance(features, action, self.sample(inputs_of(features, action), generator))
+        return advance(features, action, self.sampler(inputs_of(features, action), generator))
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps [nat per step], and calibration error.

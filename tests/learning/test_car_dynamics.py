@@ -112,7 +112,7 @@ def test_draws_have_the_moments_of_the_mixture(dof: float) -> None:
     values = torch.randn(4, 6, generator=torch.Generator().manual_seed(2))
     car = constant_car(values, dof, noise=0.85)
     count = 40_000
-    drawn = car.sample(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
+    drawn = car.sampler(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
     unit = torch.arange(1.0, 7.0).double()
     means = 0.3 + values.double() * unit
     scales = np.ones(4) if math.isinf(dof) else np.sqrt(dof / chi2.ppf([0.125, 0.375, 0.625, 0.875], dof))
@@ -132,7 +132,7 @@ def test_draws_have_the_moments_of_the_mixture(dof: float) -> None:
 
 def test_rows_are_assigned_evenly_and_randomly_to_particles() -> None:
     car = constant_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
-    drawn = car.sample(torch.zeros(200, INPUTS), torch.Generator().manual_seed(0))
+    drawn = car.sampler(torch.zeros(200, INPUTS), torch.Generator().manual_seed(0))
     particle_of_row = (drawn[:, 0] - 0.3).round().int()
     assert torch.bincount(particle_of_row).tolist() == [40] * 5
     assert len(particle_of_row.unique_consecutive()) > 100, "rows must not be assigned in order"
@@ -142,7 +142,7 @@ def test_rows_are_assigned_evenly_and_randomly_to_particles() -> None:
 def test_each_row_draws_each_particle_equally_often_for_any_row_count(count: int) -> None:
     car = constant_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
     generator, inputs = torch.Generator().manual_seed(0), torch.zeros(count, INPUTS)
-    drawn_particles = torch.stack([(car.sample(inputs, generator)[:, 0] - 0.3).round() for _ in range(1500)])
+    drawn_particles = torch.stack([(car.sampler(inputs, generator)[:, 0] - 0.3).round() for _ in range(1500)])
     for row in {0, count - 1}:
         counts = torch.bincount(drawn_particles[:, row].int(), minlength=5)
         assert torch.all((counts - 300).abs() < 5 * math.sqrt(1500 * 0.2 * 0.8)), (row, counts)
@@ -158,7 +158,7 @@ def test_draws_stay_in_the_order_of_their_input_rows() -> None:
     car = CarDynamics(ParticlePosterior(network, parameters, torch.full((6,), 1e-4), units), HISTORY)
     inputs = torch.zeros(100, INPUTS)
     inputs[:, 0] = torch.arange(100.0) / 20.0
-    drawn = car.sample(inputs, torch.Generator().manual_seed(0))
+    drawn = car.sampler(inputs, torch.Generator().manual_seed(0))
     assert torch.allclose(drawn, inputs[:, :1].expand(100, 6), atol=1e-3)
 
 
@@ -190,7 +190,7 @@ def decorrelated(car: CarDynamics, by: torch.Tensor = DECORRELATION) -> CarDynam
 
 def test_noise_of_draws_has_the_covariance_of_the_decorrelation() -> None:
     car = decorrelated(constant_car(torch.zeros(4, 6)))
-    drawn = car.sample(torch.zeros(40_000, INPUTS), torch.Generator().manual_seed(0)).double().numpy()
+    drawn = car.sampler(torch.zeros(40_000, INPUTS), torch.Generator().manual_seed(0)).double().numpy()
     unit = np.arange(1.0, 7.0)
     back = np.linalg.inv(DECORRELATION.numpy())
     shape = 0.25 * unit[:, None] * (back @ back.T) * unit
@@ -250,7 +250,7 @@ def test_draws_of_a_car_with_all_parts_have_known_moments() -> None:
     noise = posterior.noise_std.double()
     noise_covariance = back @ (noise[:, None] * posterior.correlation.double() * noise) @ back.T
     covariance = noise_covariance + torch.cov(centres.T, correction=0)
-    drawn = car.sample(row.expand(60_000, -1), torch.Generator().manual_seed(2)).double()
+    drawn = car.sampler(row.expand(60_000, -1), torch.Generator().manual_seed(2)).double()
     spread = covariance.diagonal().sqrt()
     assert torch.allclose(drawn.mean(dim=0), centres.mean(dim=0), atol=0.02 * float(spread.max()))
     assert torch.allclose(torch.cov(drawn.T), covariance, atol=0.03 * float((spread[:, None] * spread).max()))
@@ -277,7 +277,7 @@ def test_car_loaded_from_a_file_predicts_the_same(tmp_path: Path, dof: float | N
         negative_log_likelihood(predicted, torch.zeros(50, 6)) for predicted in (original_prediction, loaded_prediction)
     ]
     assert densities[0] == densities[1]
-    first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, loaded))
+    first, second = (c.sampler(inputs, torch.Generator().manual_seed(3)) for c in (car, loaded))
     assert torch.equal(first, second)
 
 
