@@ -23,6 +23,7 @@ from carlab.experiment.cluster.settings import LinkSettings
 from carlab.experiment.cluster.trainer import ClusterTrainer
 from carlab.jobs.child_jobs import write_files
 from carlab.recording.run_folder import RunDirectory
+from tests.learning.test_files_run_no_code import Payload
 
 SETTINGS = LinkSettings(
     connect_s=40.0,
@@ -246,16 +247,6 @@ def test_first_connection_has_a_second_attempt() -> None:
     link = FakeLink([(1.0, LinkEvent("unreachable", "starting"))], [(1.0, LinkEvent("connected"))])
     with trainer_of(link)[0]:
         assert link.calls == ["send", "cut", "send"]
-
-
-class Payload:
-    """An object that creates a file when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __reduce__(self) -> tuple[Callable[..., object], tuple[Path]]:
-        return Path.touch, (self._path,)
 
 
 def other_history(folder: Path, created: Path) -> None:
