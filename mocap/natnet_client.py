@@ -56,25 +56,16 @@ class NatNetClient(Resource):
         on_models: Callable[[tuple[Description, ...]], None] | None = None,
     ) -> None:
         self.config = config
-        self.server_info: messages.ServerInfo | None = None
-        self.models: tuple[Description, ...] | None = None
-        self.server_mode: int | None = None
-        self.alignment = ClockAlignment(0.0)
         self._on_frame = on_frame
         self._on_models = on_models
         self._changed = threading.Condition()
-        self._statistics = StreamStatistics()
-        self._decoder: BitstreamSwitch | None = None
-        self._responses: list[int | None] = []
-        self._polls_mode = self._is_recording = False
         self._server = ""
         self._command: socket.socket | None = None
         self._data: socket.socket | None = None
         self._group = ("", "")
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._schedule = MessageSchedule(keepalives=config.mode == "unicast")
-        self._failure: Exception | None = None
+        self._reset()
 
     def open(self) -> None:
         """Connect, negotiate the bitstream version, request the model definitions and align the clocks. Idempotent.
@@ -205,13 +196,16 @@ class NatNetClient(Resource):
         return numbers
 
     def _reset(self) -> None:
-        self.server_info = self.models = self.server_mode = self._decoder = None
-        self._polls_mode = self._is_recording = False
+        self.server_info: messages.ServerInfo | None = None
+        self.models: tuple[Description, ...] | None = None
+        self.server_mode: int | None = None
         self.alignment = ClockAlignment(0.0)
         self._statistics = StreamStatistics()
-        self._failure = None
-        self._responses.clear()
+        self._decoder: BitstreamSwitch | None = None
+        self._responses: list[int | None] = []
+        self._polls_mode = self._is_recording = False
         self._schedule = MessageSchedule(keepalives=self.config.mode == "unicast")
+        self._failure: Exception | None = None
 
     def _connect_payload(self) -> bytes:
         wanted = self.config.bitstream_version if self.config.mode == "unicast" else None
