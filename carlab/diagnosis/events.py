@@ -118,22 +118,25 @@ def grip_limits(car: CarParameters) -> FloatArray:
     return np.array([max(car.front_mu, car.rear_mu) * GRAVITY_MPS2, yaw_acceleration])
 
 
-def _grip_ratio(stretches: Sequence[_Stretch], car: CarParameters) -> float:
-    """Grip that the recording shows over that of the car file, at least 1.
+def _grip_ratio(stretches: Sequence[_Stretch], car: CarParameters) -> FloatArray:
+    """Acceleration and yaw acceleration (2,) that the recording shows over those of the car file, at least 1.
 
-    The recording shows the accelerations that the car sustains for several rows. A collision is shorter.
+    The recording shows the accelerations that the car sustains for several rows; a collision is shorter. A car sustains
+    no yaw acceleration, so its usual one counts, and hard steering exceeds it by ``usual_factor``.
     """
-    sustained = []
+    sustained, turning = [], []
     for stretch in stretches:
         width = stretch.rows_of(EVENTS.widths_s[0])
         changes = stretch.changes(width, 0)
         is_moving = np.isfinite(changes.elapsed_s) & (stretch.speed_mps > EVENTS.moving_mps)
         steady = _steady(changes, width)[is_moving]
         sustained.append(np.hypot(steady[:, 0], steady[:, 1]) / changes.elapsed_s[is_moving])
-    sustained_mps2 = np.concatenate(sustained)
-    if len(sustained_mps2) < EVENTS.min_moving_rows:
-        return 1.0
-    return max(1.0, float(np.quantile(sustained_mps2, EVENTS.usual_quantile)) / float(grip_limits(car)[0]))
+        turning.append((changes.sizes[:, 1] / changes.elapsed_s)[is_moving])
+    shown = [np.concatenate(each) for each in (sustained, turning)]
+    if len(shown[0]) < EVENTS.min_moving_rows:
+        return np.ones(2)
+    usual = [float(np.quantile(each, EVENTS.usual_quantile)) for each in shown]
+    return np.maximum(np.array([1.0, EVENTS.usual_factor]) * usual / grip_limits(car), 1.0)
 
 
 def _steady(changes: _Changes, width: int) -> FloatArray:

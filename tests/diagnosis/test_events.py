@@ -81,6 +81,15 @@ def test_a_small_grip_in_the_car_file_adds_no_events(kind: str, seed: int, facto
     assert driven.missed_and_false(found) == (0, 0)
 
 
+@pytest.mark.parametrize("factor", [3.0, 5.0])
+@pytest.mark.parametrize(("kind", "seed"), [("", 21), ("effect", 3), ("blow", 20), ("turn", 3)])
+def test_a_large_yaw_inertia_in_the_car_file_adds_no_events(kind: str, seed: int, factor: float) -> None:
+    """The car turns in faster than its car file allows, so these motions are no events."""
+    driven = event_drive(seed, kind)
+    car = replace(driven.config.parameters, yaw_inertia_kgm2=factor * driven.config.parameters.yaw_inertia_kgm2)
+    assert driven.missed_and_false(find_events(driven.episode, replace(driven.config, parameters=car))) == (0, 0)
+
+
 def test_wrong_rows_jumps_and_stamps_are_no_events() -> None:
     driven = event_drive(13)
     rng = np.random.default_rng(0)

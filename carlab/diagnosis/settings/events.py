@@ -19,9 +19,11 @@ class EventSettings:
     usual_quantile: float = 0.98
     """Quantile of the changes of a recording that counts as usual driving: its hardest braking and steering. The same
     quantile of its steady accelerations is its grip. If that is above the grip of the car file, which may be too small,
-    an event must also exceed ``grip_factors`` with the grip of the recording."""
+    an event must also exceed ``grip_factors`` with the grip of the recording. The same holds for yaw accelerations,
+    which are above those of the car file if its yaw inertia is too large."""
     usual_factor: float = 1.45
-    """Minimum change, over the usual one. The car may brake and drive with more than the grip of its car file."""
+    """Minimum change, over the usual one. The car may brake and drive with more than the grip of its car file, and turn
+    in faster than its yaw inertia there allows."""
     noise_z: float = 6.0
     """Minimum change [standard deviations of its noise]. Errors of stamps have long tails."""
     steady_widths: int = 9
