@@ -39,7 +39,7 @@ from carlab.diagnosis.naming import (
     describe_unexplained,
     with_fewer_effects,
 )
-from carlab.diagnosis.recording_faults import find as data_faults_of
+from carlab.diagnosis.recording_faults.find import check, with_unknown_delay
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.report.next_drive import with_texts
@@ -129,11 +129,11 @@ def diagnose(
     decisions: list[Decision] = []
     with FunctionWorkers() if workers is None else nullcontext(workers) as shared:
         control = RunControl(progress, stop, decisions.append, timer.omit, timer.ends_search, shared)
-        recordings, faults = _prepare_recordings(fit, held_out, request, progress)
+        recordings, request = _prepare_recordings(fit, held_out, request, progress)
         recordings, noise, measured = _measure(recordings, request)
         accepted, scored, naming = _search_effects(recordings, noise, measured, request, control, timer)
         withdrawn = withdrawn_effects(decisions, accepted, scored.found.effects)
-        outcome = _assemble_result(scored, naming, withdrawn, recordings, replace(request, data_faults=faults), control)
+        outcome = _assemble_result(scored, naming, withdrawn, recordings, request, control)
     return _with_run(outcome, timer, effects or (), None if held_out else share, decisions)
 
 
@@ -153,13 +153,13 @@ def _with_run(
 
 def _prepare_recordings(
     fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], request: Request, progress: Progress
-) -> tuple[SplitRecordings, tuple[DataFault, ...]]:
-    """Repair faults, split the recordings, and cut them into windows."""
+) -> tuple[SplitRecordings, Request]:
+    """Repair faults, split the recordings, and cut them into windows; the request has these faults."""
     settings = request.settings.windows
     nominal = request.nominal
     progress("reading", 0.0)
     recorded_s = sum(len(e.times_s) * e.period_s for e in fit if e.ticks)
-    repaired_fit, repaired_held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
+    repaired_fit, repaired_held_out, own_faults = check(fit, held_out, nominal)
     faults = (*request.data_faults, *own_faults)
     progress("reading", 0.03)
     try:
@@ -180,7 +180,7 @@ def _prepare_recordings(
         raise
     if request.ceiling or request.discrepancy:
         check_duration(recordings.fit_segments, EnsembleSettings())
-    return recordings, faults
+    return recordings, replace(request, nominal=with_unknown_delay(nominal, faults), data_faults=faults)
 
 
 def _candidates(request: Request) -> tuple[str, ...]:

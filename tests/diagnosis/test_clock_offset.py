@@ -7,8 +7,10 @@ import pytest
 from scipy.signal import lfilter
 
 from carlab.core.episode_data import EpisodeData
+from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.recording_faults.find import check
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.recorded_drives import drive
 
 NOMINAL = SimulatorConfig.from_preset()
 DELAY_S = NOMINAL.command_delay_s + NOMINAL.mocap.latency_s
@@ -102,3 +104,16 @@ def test_slow_commands_do_not_show_the_clock():
     drive = kinematic_drive(t_s, 0.2 + 0.15 * steps, 0.4 + 0.0 * t_s)
     _, _, faults = check([drive, replace(drive, sent=np.roll(drive.sent, 100, axis=0))], [], NOMINAL)
     assert not offsets(faults)
+
+
+def test_delay_after_an_offset_is_fitted_and_no_finding():
+    """A servo with a lag of 0.1 s: neither the offset nor the lag of the servo is reported as a delay."""
+    true = replace(NOMINAL, effects={"steering_lag": {"time_constant": 0.1}})
+    driven = drive(true, seconds=120.0, seed=3)
+    late = replace(driven, sent=np.roll(driven.sent, -90, axis=0))
+    diagnosis = diagnose([late], [], NOMINAL, effects=["command_delay", "mocap_latency", "steering_lag"]).diagnosis
+    assert [fault.id for fault in diagnosis.data_faults] == ["clock_offset"]
+    (effect,) = diagnosis.effects
+    assert effect.id == "steering_lag"
+    assert effect.parameters["time_constant"].value == pytest.approx(0.1, abs=0.01)
+    assert diagnosis.parameters["timing.command_delay"].value >= 0.0

@@ -68,6 +68,15 @@ def test_change_is_named_with_its_size_although_the_simulator_lacks_physics(slow
     assert found.changes[0].parameters["time_constant"].value == pytest.approx(LAG_S, rel=0.1)
 
 
+@pytest.mark.parametrize("rows", [-70, 95])
+def test_repaired_clock_offset_is_no_change_of_the_delay(first, unchanged, rows):
+    """The delay of the repaired commands is known to about a row; a row later is no change either."""
+    late = replace(unchanged, sent=np.roll(unchanged.sent, rows, axis=0))
+    found = compare([first], [late], CAR, candidates=CANDIDATES)
+    assert [fault.id for fault in found.data_faults] == ["clock_offset"]
+    assert (found.verdict, found.changes) == ("nothing", ())
+
+
 def test_interval_of_a_large_change_contains_it(slower_servo):
     estimate = slower_servo.changes[0].parameters["time_constant"]
     assert estimate.low90 <= LAG_S <= estimate.high90

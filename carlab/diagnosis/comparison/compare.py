@@ -3,7 +3,8 @@
 The simulator is fitted to the first group. The change of its errors by each candidate is computed once. A linear
 estimate in both groups then gives the likelihood ratio and the significance of each candidate. The best ones are fitted
 to the second group. Physics that the simulator lacks is in the errors of both groups, so it cancels in the difference.
-A change must also be more significant than any that comparisons within the first group show.
+A change must also be more significant than any that comparisons within the first group show. A delay of all commands
+is no change if a clock offset was repaired, because a repair is accurate to about a row.
 """
 
 from __future__ import annotations
@@ -34,9 +35,13 @@ from carlab.diagnosis.comparison.result import Change, Comparison, ComparisonVer
 from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.recording_faults.find import with_unknown_delay
+from carlab.diagnosis.selection.problem import delays_all_commands
 from carlab.diagnosis.settings import COMPARISON
 from carlab.diagnosis.state_alignment import naming_lost_frames
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS
+from sim_backends.measurement import COMMAND_DELAY
 from sim_backends.registry import REGISTRY
 
 
@@ -79,6 +84,8 @@ def compare(
         compared = compared_groups(reference, changed, nominal)
     screened = _screen(compared, candidates, progress, stop)
     changes, tested, is_complete = _select(compared, screened, progress, stop)
+    if COMMAND_DELAY in with_unknown_delay(nominal, compared.data_faults).unknown:
+        changes = tuple(c for c in changes if c.id not in EFFECTS or not delays_all_commands(c.id))
     verdict: ComparisonVerdict = "changed" if changes else "nothing" if is_complete else "inconclusive"
     seconds = MonotonicClock().now_s() - began_s
     sentence = verdict_sentence(verdict, changes, is_complete=is_complete)

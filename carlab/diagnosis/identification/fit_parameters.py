@@ -12,7 +12,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.settings import IDENTIFICATION
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS
-from sim_backends.measurement import LATENCY
+from sim_backends.measurement import COMMAND_DELAY, LATENCY
 from sim_backends.registry import REGISTRY
 
 BASE_PARAMETERS = (
@@ -82,7 +82,7 @@ class FitParameter:
 
 
 def base_parameters(config: SimulatorConfig, *, uses_std: bool = False) -> tuple[FitParameter, ...]:
-    """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency.
+    """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency or delay.
 
     Args:
         config: the simulator.
@@ -113,6 +113,14 @@ def base_parameters(config: SimulatorConfig, *, uses_std: bool = False) -> tuple
             FitParameter(
                 LATENCY, values[LATENCY], IDENTIFICATION.latency_std_s, 0.0, IDENTIFICATION.max_latency_s, prior_z=1.0,
                 is_delay=True,
+            )
+        )  # fmt: skip
+    if COMMAND_DELAY in config.unknown:
+        delay_s = values[COMMAND_DELAY]
+        found.append(
+            FitParameter(
+                COMMAND_DELAY, delay_s, IDENTIFICATION.delay_std_s, 0.0, delay_s + IDENTIFICATION.max_added_delay_s,
+                prior_z=1.0, is_delay=True,
             )
         )  # fmt: skip
     return tuple(found)

@@ -132,14 +132,23 @@ def _motions_after_clock_offsets(repairs: Sequence[EpisodeRepair], expected_s: f
 
 
 def _without_clock_offset(repair: EpisodeRepair, fault: Fault, expected_s: float, advice: str) -> GridMotion:
-    """Shift both commands to the delay of the car file. Returns the motion of the remaining rows."""
-    rows = round((expected_s - fault.evidence["delay_s"]) / repair.period_s)
+    """Shift both commands to the delay of the car file. Returns the motion of the remaining rows.
+
+    The actuators may add delays, so the command with the smaller delay shows that of both.
+    """
+    delays_s = [
+        fault.evidence[key] - method_s
+        for channel, method_s in zip(COMMAND_CHANNELS, METHOD_LAG_S, strict=True)
+        if (key := f"{channel}_delay_s") in fault.evidence
+    ]
+    rows = round((expected_s - min(delays_s)) / repair.period_s)
     late_s = rows * repair.period_s
     for channel in range(len(COMMAND_CHANNELS)):
         repair.retime(channel, -late_s)
     repair.trim(abs(rows) + 1, at_end=rows > 0)
     change = f"{'reduced' if rows > 0 else 'increased'} by {abs(late_s):.2f} s"
-    repair.repaired(fault, f"the stamps of the commands were {change}; {advice}")
+    remedy = f"the stamps of the commands were {change}, and their unknown delay was fitted; {advice}"
+    repair.repaired(fault, remedy)
     return grid_motion(repair.times_s, repair.motion(), repair.segment)
 
 

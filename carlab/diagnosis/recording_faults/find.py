@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.findings import DataFault
@@ -13,6 +14,7 @@ from carlab.diagnosis.recording_faults.pose import check_pose
 from carlab.diagnosis.recording_faults.velocity import check_velocities
 from carlab.diagnosis.state_alignment import lost_frames
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.measurement import COMMAND_DELAY
 
 
 def check(
@@ -52,3 +54,9 @@ def check(
         faults.append(DataFault("lost_frames", "x, y, yaw", rows, f"reported: {sentence}."))
     faults += check_integration(repaired[: len(fit)], nominal)
     return repaired[: len(fit)], repaired[len(fit) :], faults
+
+
+def with_unknown_delay(config: SimulatorConfig, faults: Sequence[DataFault]) -> SimulatorConfig:
+    """Mark the command delay as unknown if a clock offset hid it, so that it is fitted and no effect explains it."""
+    is_hidden = any(fault.id == "clock_offset" and fault.action.startswith("repaired") for fault in faults)
+    return replace(config, unknown=config.unknown | {COMMAND_DELAY}) if is_hidden else config

@@ -27,6 +27,7 @@ from carlab.prediction.errors import simulation_errors
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS, EffectParameter
+from sim_backends.measurement import COMMAND_DELAY, LATENCY
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,4 +247,11 @@ def has_infinite_identity(parameter: EffectParameter) -> bool:
 def is_applicable(config: SimulatorConfig, effect: str) -> bool:
     """Whether the effect can be identified with this base model and its free parameters."""
     of_unknown = any(p.same_as in config.unknown for p in EFFECTS[effect].parameters)
+    if COMMAND_DELAY in config.unknown and delays_all_commands(effect):
+        return False
     return config.kind in EFFECTS[effect].base_models and not of_unknown
+
+
+def delays_all_commands(effect: str) -> bool:
+    """Whether the effect has the influence of the command delay; a latency of motion capture has it too."""
+    return any(p.reduces == COMMAND_DELAY or p.same_as == LATENCY for p in EFFECTS[effect].parameters)

@@ -62,6 +62,11 @@ class IdentificationSettings:
     a network have 3 to 30 ms."""
     max_latency_s: float = 0.15
     """Maximum latency [s] of motion capture."""
+    delay_std_s: float = 0.03
+    """Prior standard deviation [s] of the command delay after a repair of a clock offset, which is accurate to about a
+    row."""
+    max_added_delay_s: float = 0.2
+    """Maximum command delay [s] after such a repair in addition to that of the car file."""
     min_noise_std: tuple[float, ...] = (1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4)
     """Minimum noise of x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]: keeps weights of noise-free data finite."""
     min_power_share: float = 0.5

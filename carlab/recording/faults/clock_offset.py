@@ -36,7 +36,9 @@ MIN_POWER_SHARE = 0.25
 def clock_offset(motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatArray]) -> Fault | None:
     """The fault of both commands (N,), held from each of ``t_s`` (N,) on, if their clock differs by seconds.
 
-    Its evidence has ``delay_s``, the delay of the motion in the recording [s], and ``unexplained_ratio``.
+    Its evidence has ``delay_s``, the delay of the motion in the recording with the lags of the car [s], the delay
+    ``steering_delay_s`` or ``throttle_delay_s`` without them of each command that clearly shows it, and
+    ``unexplained_ratio``.
     """
     if motion.rows.sum() < MIN_ROWS:
         return None
@@ -52,19 +54,21 @@ def clock_offset(motion: GridMotion, t_s: FloatArray, commands: Sequence[FloatAr
     lag_s, ratio = _distinct_peak(lags_s, information, float(motion.rows.sum() * motion.period_s))
     if LAGS_S[0] <= lag_s <= LAGS_S[-1] or ratio < LIMITS.offset_unexplained_ratio:
         return None
-    delays_s = []
+    found: dict[str, CommandResponse] = {}
     for channel, command, min_share in zip(COMMAND_CHANNELS, commands, LIMITS.command_explained, strict=True):
         response = command_response(motion, t_s + lag_s, command, channel)
         if response is not None and response.best >= min_share and response.gain > 0 and response.is_lag_inside:
-            delays_s.append(lag_s + response.lag_s + response.time_constant_s)
-    if not delays_s:
+            found[channel] = response
+    if not found:
         return None
-    delay_s = float(np.mean(delays_s))
+    delay_s = lag_s + float(np.mean([response.lag_s + response.time_constant_s for response in found.values()]))
+    clear = {channel: r for channel, r in found.items() if r.best >= LIMITS.clear_response} or found
+    own_delays_s = {f"{channel}_delay_s": lag_s + response.lag_s for channel, response in clear.items()}
     observation = (
         f"the motion {'precedes' if delay_s < 0 else 'follows'} the commands by {abs(delay_s):.2f} s: commands and "
         "poses have different clocks"
     )
-    evidence = {"delay_s": delay_s, "unexplained_ratio": ratio}
+    evidence = {"delay_s": delay_s, **own_delays_s, "unexplained_ratio": ratio}
     return Fault("clock_offset", ", ".join(COMMAND_CHANNELS), observation, evidence)
 
 

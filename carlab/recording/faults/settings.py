@@ -94,6 +94,8 @@ class FaultSettings:
 
     command_explained: tuple[float, float] = (0.3, 0.15)
     """Share of the motion that steering and throttle explain where their sign and lag are known."""
+    clear_response: float = 0.8
+    """Share of the motion that a command explains where its lag is accurate to about a row."""
     early_response_s: float = 0.03
     """[s] A response this much before its command exceeds the error of the method (0.02 s); its sign means nothing."""
     constant_command: float = 0.02
