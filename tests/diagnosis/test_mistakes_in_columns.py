@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.recording_faults.find import check
@@ -59,6 +60,27 @@ def test_velocities_less_than_half_a_row_early_are_no_fault(clean):
     (found,), _, faults = check([shifted], [], NOMINAL)
     assert not faults
     assert found is shifted
+
+
+def filtered_in_world(episode: EpisodeData, time_constant_s: float) -> EpisodeData:
+    """Velocities that a program filters along the axes of the room and then rotates by the yaw of the row."""
+    heading = np.exp(1j * episode.states[:, 2])
+    share = 1.0 - np.exp(-np.median(np.diff(episode.times_s)) / time_constant_s)
+    room = (episode.states[:, VX] + 1j * episode.states[:, VY]) * heading
+    body = lfilter([share], [1.0, share - 1.0], room) / heading
+    velocity = np.column_stack([body.real, body.imag])
+    return with_states(episode, lambda states: states.__setitem__((slice(None), slice(VX, VY + 1)), velocity))
+
+
+@pytest.mark.parametrize("time_constant_s", [0.05, 0.1, 0.2])
+def test_velocities_filtered_in_the_world_frame_are_replaced(clean, time_constant_s):
+    """While the car turns, this filter puts a part of vx into vy. No filter of body velocities does that."""
+    (fit,), _, (fault,) = check([filtered_in_world(clean, time_constant_s)], [], NOMINAL)
+    assert (fault.id, fault.channel) == ("wrong_frame", "vx, vy")
+    stated_s = 1e-3 * float(re.search(r"lag of about (\d+) ms", fault.action)[1])
+    assert stated_s == pytest.approx(time_constant_s, abs=0.02)
+    rows = slice(5, -5)
+    np.testing.assert_allclose(fit.states[rows, VY], clean.states[rows, VY], atol=0.12)
 
 
 def test_exchanged_command_columns_are_repaired(clean, held):

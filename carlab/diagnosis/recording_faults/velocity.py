@@ -25,6 +25,7 @@ from carlab.recording.faults.velocity import (
     spike_fault,
     velocity_references,
     velocity_spikes,
+    world_filtered_velocities,
     wrong_frame_rate,
     wrong_velocity_frame,
 )
@@ -32,7 +33,7 @@ from carlab.recording.pose_velocity import PoseMotion
 
 
 def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
-    """Check and repair vx, vy and yaw rate of recordings: frame, scale, spikes, early and late columns.
+    """Check and repair vx, vy and yaw rate of recordings: frame, filter, scale, spikes, early and late columns.
 
     Args:
         repairs: the recordings.
@@ -44,10 +45,7 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
     for k, motion in motions.items():
         _check_columns(repairs[k], motion)
     _replace_early(repairs, motions, alike=alike)
-    found = {
-        k: backward_differences(repairs[k].times_s, repairs[k].states, repairs[k].segment, m)
-        for k, m in motions.items()
-    }
+    found = {k: _backward_differences(repairs[k], m) for k, m in motions.items()}
     late = {k: fault for k, fault in found.items() if fault is not None}
     if alike and len(late) < len(repairs):
         return
@@ -57,6 +55,10 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
             _rebuild_clock(repairs[k], *clocks[k])
         repairs[k].set_velocities(repairs[k].motion())
         repairs[k].repaired(fault, "the velocities were estimated from the pose without delay")
+
+
+def _backward_differences(repair: EpisodeRepair, motion: PoseMotion) -> Fault | None:
+    return backward_differences(repair.times_s, repair.states, repair.segment, motion)
 
 
 def _replace_early(repairs: Sequence[EpisodeRepair], motions: Mapping[int, PoseMotion], *, alike: bool) -> None:
@@ -75,13 +77,18 @@ def _replace_early(repairs: Sequence[EpisodeRepair], motions: Mapping[int, PoseM
 
 
 def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
-    """Frame of the velocities, then scale and spikes of each column."""
+    """Frame and filter of the velocities, then scale and spikes of each column."""
     _check_frame(repair, motion)
     rotated = rotated_velocity(repair.states[:, 3:5].T, motion)
     if rotated is not None:  # If the yaw is wrong, the diagnosis finds it as mocap_yaw_misalignment.
         vx, vy = repair.states[:, 3:5].T.copy()
         repair.states[:, 3], repair.states[:, 4] = to_world(vx, vy, np.asarray(rotated.evidence["offset_rad"]))
         repair.repaired(rotated, "vx and vy were rotated back by that angle")
+    filtered = world_filtered_velocities(repair.times_s, repair.states, motion)
+    if filtered is not None and _backward_differences(repair, motion) is None:  # those have their own repair
+        repair.has_velocity_columns = False
+        repair.repaired(filtered, "the velocities were estimated from the pose")
+        return  # in vy, such a filter looks like a wrong sign or a factor
     _check_scales(repair, motion)
     for channel in VELOCITY_CHANNELS:
         _check_spikes(repair, motion, channel)

@@ -12,17 +12,31 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.recording.column_mapping import UNITS, VELOCITY_CHANNELS
 from carlab.recording.faults.fault import Fault
-from carlab.recording.faults.robust import LAGS_S, ColumnFit, fit_column, robust_std
+from carlab.recording.faults.robust import (
+    FILTER_LAG_PERIODS,
+    LAGS_S,
+    ColumnFit,
+    first_order_lag,
+    fit_column,
+    robust_std,
+    trimmed_scale,
+)
 from carlab.recording.faults.settings import LIMITS
 from carlab.recording.pose_velocity import BoolArray, PoseMotion
 
 Frame = Literal["body", "world"]
 MIN_COMPARED_ROWS = 60
 """Minimum number of rows with motion for a comparison of a velocity with the pose."""
+SMOOTHING_S = 0.08
+"""[s] Standard deviation of the Gaussian that smooths both velocities before filters are compared."""
+WORLD_FILTERS_S = np.arange(0.0, 0.3001, 0.02)
+"""[s] Time constants of filters of the velocities in the world frame."""
 
 
 def velocity_references(motion: PoseMotion, frame: Frame = "body") -> dict[str, FloatArray]:
@@ -248,6 +262,41 @@ def early_velocities(t_s: FloatArray, states: FloatArray, motion: PoseMotion) ->
     lead_s = -float(np.mean([fault.evidence["lag_s"] for fault in found if fault is not None]))
     observation = f"the velocities precede the motion of the pose by {lead_s * 1e3:.0f} ms: the poses are late"
     return Fault("column_shift", "vx, vy, yaw_rate", observation, {"lead_s": lead_s}, "--velocities pose")
+
+
+def world_filtered_velocities(t_s: FloatArray, states: FloatArray, motion: PoseMotion) -> Fault | None:
+    """Velocities in ``states`` (N, 6) that were filtered in the world frame and then rotated by the present yaw.
+
+    While the car turns, such a filter puts a part of the forward velocity into vy: about vx times yaw rate times lag. A
+    filter of body velocities does not. Only vy is compared, because vx hardly differs.
+    """
+    moving = comparable_rows(motion, "vx")
+    if moving.sum() < MIN_COMPARED_ROWS:
+        return None
+    period_s = float(np.median(np.diff(t_s)))
+    width = SMOOTHING_S / period_s
+    column = gaussian_filter1d(states[:, 4], width)[moving]
+
+    def remainder(frame: Frame, time_constant_s: float, dead_time_s: float) -> float:
+        """Mean square of vy that the pose leaves, with both of its velocities filtered in a frame."""
+        references = (velocity_references(motion, frame)[channel] for channel in ("vx", "vy"))
+        filtered = (first_order_lag(each, period_s, time_constant_s) for each in references)
+        ahead, left = (np.interp(t_s - dead_time_s, t_s, each) for each in filtered)
+        vy = left if frame == "body" else to_body(ahead, left, motion.yaw_unwrapped)[1]
+        return trimmed_scale(gaussian_filter1d(vy, width)[moving], column)[1]
+
+    filters = [(tau, rows * period_s) for tau in WORLD_FILTERS_S for rows in FILTER_LAG_PERIODS]
+    in_body = min(remainder("body", *each) for each in filters)
+    in_world = [remainder("world", *each) for each in filters]
+    if min(in_world) >= LIMITS.frame_ratio * in_body:
+        return None
+    lag_s = sum(filters[int(np.argmin(in_world))])
+    rms_mps = math.sqrt(in_body)
+    observation = (
+        f"vx and vy were filtered in the world frame (lag of about {lag_s * 1e3:.0f} ms) and then rotated by the yaw, "
+        f"so a part of vx is in vy (about {rms_mps:.2g} m/s)"
+    )
+    return Fault("wrong_frame", "vx, vy", observation, {"lag_s": lag_s, "remainder_mps": rms_mps}, "--velocities pose")
 
 
 def backward_differences(t_s: FloatArray, states: FloatArray, segment: FloatArray, motion: PoseMotion) -> Fault | None:
