@@ -77,7 +77,7 @@ def test_velocities_filtered_in_the_world_frame_are_replaced(clean, time_constan
     """While the car turns, this filter puts a part of vx into vy. No filter of body velocities does that."""
     (fit,), _, (fault,) = check([filtered_in_world(clean, time_constant_s)], [], NOMINAL)
     assert (fault.id, fault.channel) == ("wrong_frame", "vx, vy")
-    stated_s = 1e-3 * float(re.search(r"lag of about (\d+) ms", fault.action)[1])
+    stated_s = 1e-3 * float(re.search(r"about (\d+) ms before", fault.action)[1])
     assert stated_s == pytest.approx(time_constant_s, abs=0.02)
     rows = slice(5, -5)
     np.testing.assert_allclose(fit.states[rows, VY], clean.states[rows, VY], atol=0.12)

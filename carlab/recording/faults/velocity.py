@@ -293,8 +293,8 @@ def world_filtered_velocities(t_s: FloatArray, states: FloatArray, motion: PoseM
     lag_s = sum(filters[int(np.argmin(in_world))])
     rms_mps = math.sqrt(in_body)
     observation = (
-        f"vx and vy were filtered in the world frame (lag of about {lag_s * 1e3:.0f} ms) and then rotated by the yaw, "
-        f"so a part of vx is in vy (about {rms_mps:.2g} m/s)"
+        f"vx and vy are those of the world frame about {lag_s * 1e3:.0f} ms before (by a filter or a difference of "
+        f"poses), rotated by the present yaw, so a part of vx is in vy (about {rms_mps:.2g} m/s)"
     )
     return Fault("wrong_frame", "vx, vy", observation, {"lag_s": lag_s, "remainder_mps": rms_mps}, "--velocities pose")
 
