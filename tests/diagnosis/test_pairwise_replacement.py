@@ -1,13 +1,15 @@
 """Replacement of effects by confusable effects."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from carlab.diagnosis.selection import pairwise_tests
-from carlab.diagnosis.selection.elimination import EliminationResult
+from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.pairwise_tests import PairwiseResult, choose_confusable
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import fit_base
+from carlab.diagnosis.selection.refit import fit_base, refit
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -38,3 +40,19 @@ def test_two_effects_that_fit_equally_well_do_not_replace_one_another_again_and_
     model, _ = choose_confusable(problem, EliminationResult(Model(effects, base.fit, base.scale), {}), RunControl())
     assert model.effects == (LATENCY, *effects[1:])
     assert compared == [effects, model.effects]
+
+
+def test_indistinguishable_effect_within_its_range_replaces_one_at_a_bound() -> None:
+    """The commands act 8.5 ms earlier than the car file states: 0.5 ms more than its latency of motion capture."""
+    car = SimulatorConfig(control_period_s=PERIOD_S)
+    recorded = drive(replace(car, command_delay_s=car.command_delay_s - 0.0005), 30.0, 1, noise=3e-3)
+    windows = cut_windows(segments_of([recorded]), 0.8, 0.6)
+    confusable = {LATENCY: (DELAY,), DELAY: (LATENCY,)}
+    problem = SearchProblem(car, windows, np.full(6, 1e-2), np.full(6, 1e-2), confusable)
+    base = fit_base(problem)
+    model = refit(problem, (LATENCY,), base.fit, base.scale)
+    assert model.fit.values()[f"effects.{LATENCY}.latency"] == 0.0
+    chosen, pairs = choose_confusable(problem, delete_each(problem, model, RunControl()), RunControl())
+    assert chosen.effects == (DELAY,)
+    assert pairs.indistinguishable[DELAY] == (LATENCY,)
+    assert chosen.fit.values()[f"effects.{DELAY}.extra_delay"] == pytest.approx(-0.0085, abs=0.003)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.block_jackknife import clustered_gain
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
@@ -28,7 +29,8 @@ class PairwiseResult:
 
     chi2               twice the gain of the effect over its design effect
     indistinguishable  effects that left-out blocks do not distinguish from it, the nearest first
-    replacements       for an effect: the confusable effect with the lowest loss on left-out blocks, if that is lower
+    replacements       for an effect: the confusable effect with the lowest loss on left-out blocks, if that is lower;
+                       for an effect at a bound of its range, an indistinguishable one that is within its range
     """
 
     chi2: Mapping[str, float] = field(default_factory=dict)
@@ -87,7 +89,17 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
         indistinguishable[name] = tuple(close[: settings.max_indistinguishable])
         if compared and compared[0][0] < -settings.replace_z_min * compared[0][1]:
             replacements[name] = compared[0][2]
+        elif _is_at_bound(model.fit, name):
+            within = (c for _, _, c in compared if c.effect in close and not _is_at_bound(c.fit, c.effect))
+            if (candidate_within := next(within, None)) is not None:
+                replacements[name] = candidate_within
     return PairwiseResult(chi2, indistinguishable, replacements)
+
+
+def _is_at_bound(fit: Fit, effect: str) -> bool:
+    """Whether a number of an effect ended at a bound of its range."""
+    numbers = (each for each in zip(fit.free, fit.z, strict=True) if each[0].name.startswith(f"effects.{effect}."))
+    return any(not free.choice and float(free.value(z)) in (free.low, free.high) for free, z in numbers)
 
 
 def _fitted_alternatives(
