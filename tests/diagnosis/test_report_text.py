@@ -322,6 +322,12 @@ def test_a_delay_of_zero_is_a_log_with_late_commands(seconds: float, at_limit: b
     assert ("the log may have the commands later than they act" in sentence) is is_late
 
 
+@pytest.mark.parametrize(("seconds", "is_late"), [(-0.005, True), (0.005, False)])
+def test_a_delay_below_the_car_file_may_be_that_of_commands_in_rows_of_poses(seconds: float, is_late: bool) -> None:
+    sentence = effect_sentence("command_delay", {"extra_delay": around(seconds, "s")})
+    assert ("a command is half a row old on average" in sentence) is is_late
+
+
 def test_number_at_a_limit_without_information_has_no_interval() -> None:
     at_limit = Estimate(0.0, 0.0, 0.0, 0.0, "s", at_limit=True)
     sentence = effect_sentence("mocap_latency", {"latency": at_limit})

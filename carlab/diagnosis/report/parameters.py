@@ -11,12 +11,18 @@ from sim_backends.effects import EFFECTS
 
 
 def late_commands(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
-    """Sentence about a delay that reaches zero: the log may have the commands too late. Empty for other effects."""
+    """Sentence about a delay below that of the car file: the log may have the commands late. Empty otherwise."""
     if effect_id not in EFFECTS:
         return ""
     reducing = [parameters.get(p.name) for p in EFFECTS[effect_id].parameters if p.reduces]
-    if not any(e is not None and e.at_limit and e.value < 0.0 for e in reducing):
+    early = [e for e in reducing if e is not None and e.value < 0.0]
+    if not early:
         return ""
+    if not any(e.at_limit for e in early):
+        return (
+            " The log may have the commands late: if its rows are poses with the newest command, a command is half a "
+            "row old on average."
+        )
     return (
         " The delay adds up to 0 s: the log may have the commands later than they act. Correct it with carlab import "
         "--command-lag."
