@@ -21,7 +21,7 @@ from carlab.diagnosis.findings import (
     Unexplained,
 )
 from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
-from carlab.diagnosis.report.next_drive import drive_command, next_drive
+from carlab.diagnosis.report.next_drive import drive_command, next_drive, with_texts
 from carlab.diagnosis.report.numbers import number, percent, unit_text
 from carlab.diagnosis.report.residual import explained_share, formula_symbols
 from carlab.diagnosis.report.sentences import (
@@ -292,6 +292,31 @@ def test_search_that_was_cut_short_has_not_excluded_the_catalogue() -> None:
     assert "no effect of the catalogue" not in sentence
     assert "even in steering" not in sentence
     assert next_drive(cut) == ("", "Diagnose these recordings again with a longer time limit, before another drive.")
+
+
+def test_wrong_parameters_come_before_a_small_residual() -> None:
+    """A car whose front tyres have less grip: the refit leaves little, and the cause is the number of the car file."""
+    unexplained = Unexplained(1.0, ("yaw",), "everywhere alike", "odd in steering", "a_x = -1 |d|")
+    whole = replace(
+        diagnosis("unexplained", refit=1.4),
+        unexplained=unexplained,
+        parameters={"tyre.front.mu": around(0.42, "1")},
+        car_file_parameters={"tyre.front.mu": 0.62},
+    )
+    assert verdict_sentence(whole).startswith(
+        "Parameters of the car file are wrong: tyre.front.mu is 0.42 (car file: 0.62). With fitted parameters, the "
+        "position error on held-out recordings after 1 s goes from 0.1 m to 0.1 m (all channels: from 6 to 1.4 noise "
+        "floors). The simulator also lacks physics that no effect of the catalogue explains."
+    )
+    refit = FitErrors(0.1, 0.1, 0.1, 0.1, 0.1, 5.0)
+    little = replace(whole, held_out={**whole.held_out, "refit": refit})
+    assert verdict_sentence(little).startswith("The simulator lacks physics that no effect of the catalogue explains.")
+
+
+def test_latency_is_stated_with_that_of_the_car_file() -> None:
+    found = replace(diagnosis("mismatch", finding("mocap_latency")), car_file_parameters={"mocap.latency": 0.012})
+    (effect,) = with_texts(found).effects
+    assert effect.sentence.endswith("at 90 %). The car file states 0.012 s.")
 
 
 def test_restricted_search_has_not_excluded_the_catalogue() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis
 from carlab.diagnosis.report.numbers import listed
+from carlab.diagnosis.report.parameters import stated_number
 from carlab.diagnosis.report.recording_causes import limited_channels
 from carlab.diagnosis.report.residual import differs_when_held_out, relevant_residual, remaining_share
 from carlab.diagnosis.report.sentences import (
@@ -73,7 +74,8 @@ def with_texts(diagnosis: Diagnosis) -> Diagnosis:
     effects = tuple(
         replace(
             e,
-            sentence=effect_sentence(e.id, e.parameters, e.car_file_values),
+            sentence=effect_sentence(e.id, e.parameters, e.car_file_values)
+            + ("" if e.car_file_values else stated_number(e.id, diagnosis.car_file_parameters)),
             separating_drive=separating_drive(e.id, e.indistinguishable_from),
         )
         for e in diagnosis.effects

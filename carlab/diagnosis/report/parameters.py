@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from carlab.diagnosis.findings import Diagnosis, Estimate
 from carlab.diagnosis.report.numbers import listed, with_unit
+from carlab.diagnosis.report.residual import error_fall
 from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
 
@@ -27,6 +28,21 @@ def late_commands(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
         " The delay adds up to 0 s: the log may have the commands later than they act. Correct it with carlab import "
         "--command-lag."
     )
+
+
+def stated_number(effect_id: str, car_file_parameters: Mapping[str, float]) -> str:
+    """Sentence, after a space, with the number of the car file that an effect replaces; empty without one number."""
+    numbers = EFFECTS[effect_id].parameters if effect_id in EFFECTS else ()
+    if len(numbers) != 1 or numbers[0].same_as not in car_file_parameters:
+        return ""
+    return f" The car file states {with_unit(car_file_parameters[numbers[0].same_as], numbers[0].unit)}."
+
+
+def fitted_parameters(diagnosis: Diagnosis) -> str:
+    """Sentences about the wrong parameters of the car file and the held-out error with fitted ones."""
+    which = f": {found}" if (found := wrong_parameters(diagnosis)) else ""
+    tail = f" With fitted parameters, {fall}." if (fall := error_fall(diagnosis, "nominal", "refit")) else ""
+    return f"Parameters of the car file are wrong{which}.{tail}"
 
 
 def wrong_parameters(diagnosis: Diagnosis) -> str:

@@ -6,16 +6,29 @@ import math
 import re
 
 from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, final_model_name
+from carlab.diagnosis.report.numbers import number, with_unit
 from carlab.diagnosis.settings import EVIDENCE, REPORT
 
 
-def explained_share(diagnosis: Diagnosis, model: str = "with_effects") -> float:
-    """Share of the refit's squared excess over the noise floor that a model explains, at most 1; NaN if unknown."""
+def explained_share(diagnosis: Diagnosis, model: str = "with_effects", *, before: str = "refit") -> float:
+    """Share of the squared excess over the noise floor of ``before`` that a model explains, at most 1, or NaN."""
     held = diagnosis.held_out
-    if "refit" not in held or model not in held or not held["refit"].score > 1.0:
+    if before not in held or model not in held or not held[before].score > 1.0:
         return math.nan
-    refit, with_model = (held[name].score ** 2 - 1.0 for name in ("refit", model))
-    return 1.0 - max(with_model, 0.0) / refit
+    excess, with_model = (held[name].score ** 2 - 1.0 for name in (before, model))
+    return 1.0 - max(with_model, 0.0) / excess
+
+
+def error_fall(diagnosis: Diagnosis, before: str, after: str) -> str:
+    """Clause with the held-out errors of two models; empty if one of them is unknown."""
+    held = diagnosis.held_out
+    if before not in held or after not in held:
+        return ""
+    return (
+        f"the position error on held-out recordings after {with_unit(diagnosis.horizon_s, 's')} goes from "
+        f"{with_unit(held[before].position_m, 'm')} to {with_unit(held[after].position_m, 'm')} (all channels: from "
+        f"{number(held[before].score)} to {number(held[after].score)} noise floors)"
+    )
 
 
 def remaining_share(diagnosis: Diagnosis) -> float:

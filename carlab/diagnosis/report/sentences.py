@@ -12,9 +12,15 @@ from collections.abc import Mapping, Sequence
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
 from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
-from carlab.diagnosis.report.parameters import excluded_sizes, late_commands, parameters_at_limit, wrong_parameters
+from carlab.diagnosis.report.parameters import excluded_sizes, fitted_parameters, late_commands, parameters_at_limit
 from carlab.diagnosis.report.recording_causes import limited_channels, recording_causes
-from carlab.diagnosis.report.residual import differs_when_held_out, explained_share, is_above_noise, relevant_residual
+from carlab.diagnosis.report.residual import (
+    differs_when_held_out,
+    error_fall,
+    explained_share,
+    is_above_noise,
+    relevant_residual,
+)
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import EVIDENCE, REPORT
 from sim_backends.effects import EFFECTS, Confusable, separation
@@ -274,20 +280,9 @@ def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
     )
 
 
-def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
-    held = diagnosis.held_out
-    if before not in held or after not in held:
-        return ""
-    return (
-        f"the position error on held-out recordings after {with_unit(diagnosis.horizon_s, 's')} goes from "
-        f"{with_unit(held[before].position_m, 'm')} to {with_unit(held[after].position_m, 'm')} (all channels: from "
-        f"{number(held[before].score)} to {number(held[after].score)} noise floors)"
-    )
-
-
 def _mismatch(diagnosis: Diagnosis) -> str:
     effects, text = diagnosis.effects, " ".join(_statements(diagnosis.effects))
-    if fall := _fall(diagnosis, "refit", "with_effects"):
+    if fall := error_fall(diagnosis, "refit", "with_effects"):
         share = explained_share(diagnosis)
         known = f", which explains {percent(share)} of the refit's squared excess over the noise floor"
         named = "it" if len(effects) == 1 else "them"
@@ -313,11 +308,9 @@ def _statements(effects: Sequence[EffectFinding]) -> list[str]:
 
 
 def _parameters(diagnosis: Diagnosis) -> str:
-    tail = f" With fitted parameters, {fall}." if (fall := _fall(diagnosis, "nominal", "refit")) else ""
-    which = f": {found}" if (found := wrong_parameters(diagnosis)) else ""
-    text = f"No missing physics is found. Parameters of the car file are wrong{which}."
+    text = f"No missing physics is found. {fitted_parameters(diagnosis)}"
     warnings = f"{_warning_above_noise(diagnosis, 'refit')}{_warning_of_fitted(diagnosis)}"
-    return f"{text}{tail}{parameters_at_limit(diagnosis)}{warnings}"
+    return f"{text}{parameters_at_limit(diagnosis)}{warnings}"
 
 
 def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
@@ -362,6 +355,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     text = "The simulator lacks physics that no effect of the catalogue explains"
     if diagnosis.search.effects:
         text = "The simulator lacks physics that none of the searched effects explains"
+    if explained_share(diagnosis, "refit", before="nominal") > 0.5:
+        text = f"{fitted_parameters(diagnosis)} {text.replace('lacks', 'also lacks')}"
     if not diagnosis.search.is_complete:
         text = "The search for effects did not finish, and it has not found what the simulator lacks"
     if rest is None:
