@@ -314,9 +314,14 @@ def test_wrong_parameters_come_before_a_small_residual() -> None:
 
 
 def test_latency_is_stated_with_that_of_the_car_file() -> None:
-    found = replace(diagnosis("mismatch", finding("mocap_latency")), car_file_parameters={"mocap.latency": 0.012})
-    (effect,) = with_texts(found).effects
+    found = diagnosis("mismatch", finding("mocap_latency"))  # of 0.03 s
+    (effect,) = with_texts(replace(found, car_file_parameters={"mocap.latency": 0.012})).effects
     assert effect.sentence.endswith("at 90 %). The car file states 0.012 s.")
+    (effect,) = with_texts(replace(found, car_file_parameters={"mocap.latency": 0.04})).effects
+    assert effect.sentence.endswith(
+        "The car file states 0.04 s. The log may have the commands late: if its rows are poses with the newest "
+        "command, a command is half a row old on average."
+    )
 
 
 def test_restricted_search_has_not_excluded_the_catalogue() -> None:

@@ -75,7 +75,7 @@ def with_texts(diagnosis: Diagnosis) -> Diagnosis:
         replace(
             e,
             sentence=effect_sentence(e.id, e.parameters, e.car_file_values)
-            + ("" if e.car_file_values else stated_number(e.id, diagnosis.car_file_parameters)),
+            + stated_number(e, diagnosis.car_file_parameters),
             separating_drive=separating_drive(e.id, e.indistinguishable_from),
         )
         for e in diagnosis.effects

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from carlab.diagnosis.findings import Diagnosis, Estimate
+from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.numbers import listed, with_unit
 from carlab.diagnosis.report.residual import error_fall
 from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
+
+COMMANDS_IN_ROWS = (
+    " The log may have the commands late: if its rows are poses with the newest command, a command is half a row old "
+    "on average."
+)
 
 
 def late_commands(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
@@ -17,25 +22,26 @@ def late_commands(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
         return ""
     reducing = [parameters.get(p.name) for p in EFFECTS[effect_id].parameters if p.reduces]
     early = [e for e in reducing if e is not None and e.value < 0.0]
-    if not early:
-        return ""
     if not any(e.at_limit for e in early):
-        return (
-            " The log may have the commands late: if its rows are poses with the newest command, a command is half a "
-            "row old on average."
-        )
+        return COMMANDS_IN_ROWS if early else ""
     return (
         " The delay adds up to 0 s: the log may have the commands later than they act. Correct it with carlab import "
         "--command-lag."
     )
 
 
-def stated_number(effect_id: str, car_file_parameters: Mapping[str, float]) -> str:
-    """Sentence, after a space, with the number of the car file that an effect replaces; empty without one number."""
-    numbers = EFFECTS[effect_id].parameters if effect_id in EFFECTS else ()
-    if len(numbers) != 1 or numbers[0].same_as not in car_file_parameters:
+def stated_number(effect: EffectFinding, car_file_parameters: Mapping[str, float]) -> str:
+    """Sentences with the number of the car file that an effect replaces; empty without one number.
+
+    A delay below that of the car file may be due to late commands, as for ``late_commands``.
+    """
+    numbers = EFFECTS[effect.id].parameters if effect.id in EFFECTS else ()
+    if effect.car_file_values or len(numbers) != 1 or numbers[0].same_as not in car_file_parameters:
         return ""
-    return f" The car file states {with_unit(car_file_parameters[numbers[0].same_as], numbers[0].unit)}."
+    (parameter,) = numbers
+    stated = car_file_parameters[parameter.same_as]
+    is_early = parameter.is_delay and effect.parameters[parameter.name].value < stated
+    return f" The car file states {with_unit(stated, parameter.unit)}.{COMMANDS_IN_ROWS if is_early else ''}"
 
 
 def fitted_parameters(diagnosis: Diagnosis) -> str:
