@@ -137,8 +137,10 @@ class DiagnosisReport:
         return f'<iframe srcdoc="{page}" style="width:100%;height:720px;border:0"></iframe>'
 
     def __repr__(self) -> str:
-        """The verdict, and one sentence for each effect."""
-        return "\n  ".join([self.sentence, *(effect.sentence for effect in self.diagnosis.effects)])
+        """The verdict, and one line for each effect."""
+        from carlab.diagnosis.report.effect_lines import effect_lines
+
+        return "\n  ".join([self.sentence, *effect_lines(self.diagnosis)])
 
 
 def diagnose(

@@ -79,6 +79,7 @@ class Diagnose:
     def _print(self, diagnosis: Diagnosis) -> None:
         from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences, curves_advice
         from carlab.diagnosis.report.drift import drift_sentences
+        from carlab.diagnosis.report.effect_lines import effect_lines
         from carlab.diagnosis.report.events import diagnosed_event_sentences
         from carlab.diagnosis.report.numbers import percent
         from carlab.diagnosis.report.residual import shown_errors
@@ -89,7 +90,7 @@ class Diagnose:
             faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in others)
             console.print(f"Faults of the recordings (listed in the report): {', '.join(faults)}.")
         console.print(diagnosis.sentence)
-        sentences = [effect.sentence for effect in diagnosis.effects] + curve_sentences(diagnosis)
+        sentences = effect_lines(diagnosis) + curve_sentences(diagnosis)
         sentences += [ceiling_sentence(diagnosis), *drift_sentences(diagnosis), *diagnosed_event_sentences(diagnosis)]
         sentences += withdrawal_sentences(diagnosis)
         for sentence in filter(None, sentences):

@@ -21,6 +21,7 @@ from carlab.diagnosis.findings import (
     Unexplained,
 )
 from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
+from carlab.diagnosis.report.effect_lines import effect_lines
 from carlab.diagnosis.report.next_drive import drive_command, next_drive, with_texts
 from carlab.diagnosis.report.numbers import number, percent, unit_text
 from carlab.diagnosis.report.residual import explained_share, formula_symbols
@@ -322,6 +323,15 @@ def test_latency_is_stated_with_that_of_the_car_file() -> None:
         "The car file states 0.04 s. The log may have the commands late: if its rows are poses with the newest "
         "command, a command is half a row old on average."
     )
+
+
+def test_lines_of_several_effects_state_how_much_each_one_matters() -> None:
+    lag, drag = finding("steering_lag"), finding("cornering_drag")
+    drag = replace(drag, evidence=replace(drag.evidence, held_out_error_reduction=0.021))
+    lines = effect_lines(with_texts(diagnosis("mismatch", lag, drag)))
+    ends = [line.partition(" Added last, ")[2] for line in lines]
+    assert ends == [f"the effect lowers the error on held-out recordings by {share} %." for share in ("30", "2.1")]
+    assert effect_lines(with_texts(diagnosis("mismatch", lag))) == [effect_sentence("steering_lag", lag.parameters)]
 
 
 def test_restricted_search_has_not_excluded_the_catalogue() -> None:

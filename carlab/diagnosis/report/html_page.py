@@ -13,6 +13,7 @@ from carlab.diagnosis.report import figures
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve_sentences
 from carlab.diagnosis.report.drift import drift_sentences
+from carlab.diagnosis.report.effect_lines import held_out_change
 from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.next_drive import drive_command, next_drive
 from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
@@ -133,11 +134,7 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
 
 def _evidence_texts(effect: EffectFinding) -> list[str]:
     evidence = effect.evidence
-    texts = []
-    fall = evidence.held_out_error_reduction
-    if math.isfinite(fall):
-        verb = "lowers" if fall >= 0 else "raises"
-        texts.append(f"Added last, the effect {verb} the error on held-out recordings by {percent(abs(fall))}.")
+    texts = [change] if (change := held_out_change(effect)) else []
     strength = evidence.standard_errors
     if math.isfinite(strength):
         verb = "lowers" if strength < 0 else "raises"
