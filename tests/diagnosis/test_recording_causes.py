@@ -65,6 +65,16 @@ def test_limited_commands_replace_the_class_of_missing_physics() -> None:
     assert limited.advice.startswith("Record again with a log of the commands that the car executes")
 
 
+def test_commands_that_predict_the_recordings_are_not_limited() -> None:
+    """A motor with a dead band responds more near the largest command, as with a log that limits the commands."""
+    held, effects = dict(mismatch().held_out), (STEERING_LAG,)
+    for score, is_stated in ((1.2, False), (3.0, True)):
+        held["with_effects"] = replace(held["with_effects"], score=score)
+        found = changed(mismatch(), effects=effects, held_out=held, data_faults=(LIMITED,))
+        assert ("The log or the radio limits the steering." in found.sentence) is is_stated
+        assert found.advice.startswith("Record again with a log of the commands") is is_stated
+
+
 def test_wrong_frame_rate_is_stated_with_the_verdict() -> None:
     fault = DataFault("wrong_frame_rate", "t, vx, vy, yaw_rate", 900, "repaired: the velocities were multiplied.")
     assert "The stamps probably have a wrong frame rate" in changed(mismatch(), data_faults=(fault,)).sentence

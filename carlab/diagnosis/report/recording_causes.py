@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding
 from carlab.diagnosis.report.numbers import listed, with_unit
+from carlab.diagnosis.report.residual import is_above_noise
 from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
 
@@ -17,7 +18,13 @@ def recording_causes(diagnosis: Diagnosis) -> str:
 
 
 def limited_channels(diagnosis: Diagnosis) -> list[str]:
-    """Commands that the log or the radio limits."""
+    """Commands that the log or the radio limits; empty if named effects explain the recordings with these commands.
+
+    Limited commands lack what the car executes, so no model with them comes near the noise floor. A driver who keeps to
+    a limit can look the same before the fit, for example if the motor has a dead band.
+    """
+    if diagnosis.verdict == "mismatch" and not is_above_noise(diagnosis, "with_effects"):
+        return []
     return list(dict.fromkeys(fault.channel for fault in diagnosis.data_faults if fault.id == LIMITED))
 
 
