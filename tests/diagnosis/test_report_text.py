@@ -334,6 +334,18 @@ def test_lines_of_several_effects_state_how_much_each_one_matters() -> None:
     assert effect_lines(with_texts(diagnosis("mismatch", lag))) == [effect_sentence("steering_lag", lag.parameters)]
 
 
+def test_effects_that_raise_the_score_explain_no_negative_share() -> None:
+    """The position error may fall although the error of all channels rises."""
+    rest = Unexplained(1.21, ("yaw",), "everywhere alike", "odd in steering", "dr/dt += -1 d")
+    worse = replace(diagnosis("mismatch", finding("steering_lag"), refit=4.0, with_effects=4.4), unexplained=rest)
+    sentence = verdict_sentence(worse)
+    assert (
+        "(all channels: from 4 to 4.4 noise floors), so the effects do not lower the error of all channels." in sentence
+    )
+    assert sentence.endswith("The refit's squared excess over the noise floor stays unexplained.")
+    assert "%" not in sentence
+
+
 def test_restricted_search_has_not_excluded_the_catalogue() -> None:
     """A car with a lag of the servo, diagnosed with --effects aerodynamic_drag, lacks physics of the catalogue."""
     unexplained = Unexplained(0.7, ("yaw",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")

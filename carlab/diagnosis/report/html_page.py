@@ -59,7 +59,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "regimes": figures.regime_charts(figure_data),
         "score_chart": figures.score_chart(figure_data),
         "explained": explained_share(diagnosis),
-        "known": bool(diagnosis.effects) and math.isfinite(explained_share(diagnosis)),
+        "known": bool(diagnosis.effects) and explained_share(diagnosis) >= 0.0,
         "driven": bool(figure_data.traces),
         "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: REPORT.max_candidates]],
         "candidate_count": len(figure_data.candidates),

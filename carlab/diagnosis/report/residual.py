@@ -6,7 +6,7 @@ import math
 import re
 
 from carlab.diagnosis.findings import Diagnosis, FitErrors, Unexplained, final_model_name
-from carlab.diagnosis.report.numbers import number, with_unit
+from carlab.diagnosis.report.numbers import number, percent, with_unit
 from carlab.diagnosis.settings import EVIDENCE, REPORT
 
 
@@ -29,6 +29,23 @@ def error_fall(diagnosis: Diagnosis, before: str, after: str) -> str:
         f"{with_unit(held[before].position_m, 'm')} to {with_unit(held[after].position_m, 'm')} (all channels: from "
         f"{number(held[before].score)} to {number(held[after].score)} noise floors)"
     )
+
+
+def explanation(diagnosis: Diagnosis) -> str:
+    """Clause, after a comma, with the share of the refit's squared excess that effects explain; empty if unknown."""
+    share = explained_share(diagnosis)
+    if not math.isfinite(share):
+        return ""
+    if share < 0.0:
+        return ", so the effects do not lower the error of all channels"
+    return f", which explains {percent(share)} of the refit's squared excess over the noise floor"
+
+
+def remainder(rest: Unexplained) -> str:
+    """Sentence, after a space, with the share of the refit's squared excess that stays unexplained."""
+    if rest.share > 1.0:
+        return " The refit's squared excess over the noise floor stays unexplained."
+    return f" Of this squared excess, {percent(rest.share)} stays unexplained."
 
 
 def remaining_share(diagnosis: Diagnosis) -> float:

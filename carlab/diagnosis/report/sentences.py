@@ -11,15 +11,17 @@ from collections.abc import Mapping, Sequence
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
-from carlab.diagnosis.report.numbers import listed, number, percent, unit_text, with_unit
+from carlab.diagnosis.report.numbers import listed, number, unit_text, with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, fitted_parameters, late_commands, parameters_at_limit
 from carlab.diagnosis.report.recording_causes import limited_channels, recording_causes
 from carlab.diagnosis.report.residual import (
     differs_when_held_out,
     error_fall,
     explained_share,
+    explanation,
     is_above_noise,
     relevant_residual,
+    remainder,
 )
 from carlab.diagnosis.report.search_extent import search_sentences
 from carlab.diagnosis.settings import EVIDENCE, REPORT
@@ -283,13 +285,11 @@ def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
 def _mismatch(diagnosis: Diagnosis) -> str:
     effects, text = diagnosis.effects, " ".join(_statements(diagnosis.effects))
     if fall := error_fall(diagnosis, "refit", "with_effects"):
-        share = explained_share(diagnosis)
-        known = f", which explains {percent(share)} of the refit's squared excess over the noise floor"
         named = "it" if len(effects) == 1 else "them"
         named = "corrected numbers" if effects and all(e.car_file_values for e in effects) else named
-        text += f" With {named}, {fall}{known if math.isfinite(share) else ''}."
+        text += f" With {named}, {fall}{explanation(diagnosis)}."
     if (rest := relevant_residual(diagnosis)) is not None:
-        return f"{text} Of this squared excess, {percent(rest.share)} stays unexplained."
+        return f"{text}{remainder(rest)}"
     return f"{text}{_warning_above_noise(diagnosis, 'with_effects')}"
 
 
