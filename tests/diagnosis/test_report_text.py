@@ -334,6 +334,15 @@ def test_lines_of_several_effects_state_how_much_each_one_matters() -> None:
     assert effect_lines(with_texts(diagnosis("mismatch", lag))) == [effect_sentence("steering_lag", lag.parameters)]
 
 
+def test_line_of_an_improbable_name_states_its_probability() -> None:
+    probable = finding("steering_lag")
+    improbable = replace(probable, confidence=0.1)
+    in_set = replace(finding("steering_lag", ("steering_delay",)), confidence=0.1)
+    lines = [effect_lines(with_texts(diagnosis("mismatch", each)))[0] for each in (probable, improbable, in_set)]
+    stated = [line.endswith(" The name is uncertain (probability 10 %).") for line in lines]
+    assert stated == [False, True, False]
+
+
 def test_effects_that_raise_the_score_explain_no_negative_share() -> None:
     """The position error may fall although the error of all channels rises."""
     rest = Unexplained(1.21, ("yaw",), "everywhere alike", "odd in steering", "dr/dt += -1 d")

@@ -7,15 +7,25 @@ import math
 from carlab.diagnosis.findings import Diagnosis, EffectFinding
 from carlab.diagnosis.report.numbers import percent
 
+UNCERTAIN = 0.5
+"""Probability of a name below which a line states it."""
+
 
 def effect_lines(diagnosis: Diagnosis) -> list[str]:
-    """The sentence of each effect; with several effects, also how much each one lowers the error.
+    """The sentence of each effect, and whether its name is uncertain.
 
-    With a single effect the verdict states that.
+    With several effects, also how much each one lowers the error; with a single effect the verdict states that.
     """
-    if len(diagnosis.effects) < 2:
-        return [effect.sentence for effect in diagnosis.effects]
-    return [f"{effect.sentence} {held_out_change(effect)}".rstrip() for effect in diagnosis.effects]
+    are_several = len(diagnosis.effects) > 1
+    lines = ((e.sentence, held_out_change(e) if are_several else "", _uncertainty(e)) for e in diagnosis.effects)
+    return [" ".join(filter(None, parts)) for parts in lines]
+
+
+def _uncertainty(effect: EffectFinding) -> str:
+    """That the name is uncertain; empty for a set, which the verdict states, and for a probable name."""
+    if effect.indistinguishable_from or effect.confidence >= UNCERTAIN:
+        return ""
+    return f"The name is uncertain (probability {percent(effect.confidence)})."
 
 
 def held_out_change(effect: EffectFinding) -> str:
