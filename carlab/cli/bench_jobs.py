@@ -37,7 +37,7 @@ class StudyJob(Generic[Result]):
         label: for the progress bar and messages.
         job: command and files.
         read: results of an ended job. Raises KeyError, TypeError or ValueError if it left none.
-        failed: results that stand for a job that left none, from the reason.
+        failed: results in place of those of a job that left none, from the reason.
     """
 
     label: str
@@ -46,7 +46,7 @@ class StudyJob(Generic[Result]):
     failed: Callable[[str], list[Result]]
 
     def results(self, end: JobEnd) -> list[Result]:
-        """Results of an ended job, or those that stand for a failed one."""
+        """Results of an ended job, or those in place of a failed one."""
         try:
             return self.read(end)
         except (KeyError, TypeError, ValueError) as error:

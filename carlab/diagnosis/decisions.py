@@ -42,7 +42,7 @@ class Decision:
     """Whether an effect passed a stage: all conditions of one of the alternatives must hold.
 
     stage          accept (the first effect that passes is added), replace (a set of effects passes or fails together),
-                   keep, support or stand (each effect alone)
+                   keep, support or confirm (each effect alone)
     effect         id of the effect
     alternatives   sets of conditions
     passed         decision

@@ -74,9 +74,9 @@ def accept_names(
     ):
         found = found.without_effects()
     elif found.effects:
-        standing = without_harmful_effects(problem, found, held_out, control)
-        if standing.effects != found.effects:
-            found, residual = standing, residual_of(problem, standing)
+        fewer = without_harmful_effects(problem, found, held_out, control)
+        if fewer.effects != found.effects:
+            found, residual = fewer, residual_of(problem, fewer)
             rival = additional_physics(problem, found, control)
         if found.is_complete and found.effects and _explain_little(problem, found, held_out, control):
             found = found.without_effects()

@@ -38,11 +38,11 @@ def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> Scor
             name: min((c.statistic / c.threshold for c in own), default=math.inf) for name, own in conditions.items()
         }
         weakest = min(ratios, key=lambda name: ratios[name])
-        stands = ratios[weakest] > 1.0
-        for name in conditions if stands else (weakest,):
+        confirmed = ratios[weakest] > 1.0
+        for name in conditions if confirmed else (weakest,):
             if conditions[name]:
-                control.record(Decision("stand", name, (conditions[name],), stands, len(conditions)))
-        if stands:
+                control.record(Decision("confirm", name, (conditions[name],), confirmed, len(conditions)))
+        if confirmed:
             break
         log.info("%s: withdrawn, because the fit does not distinguish it from its identity", weakest)
         remaining = tuple(name for name in conditions if name != weakest)
@@ -52,7 +52,7 @@ def without_uncertain_effects(scored: ScoredSearch, control: RunControl) -> Scor
 
 
 def _conditions(scored: ScoredSearch, effect: str) -> tuple[Condition, ...]:
-    """Conditions under which an effect stands: one after a joint fit, one for an effect with an infinite identity."""
+    """Conditions that confirm an effect: one after a joint fit, one for an effect with an infinite identity."""
     found = []
     if scored.is_joint:
         distance = identity_distance(scored, effect)

@@ -31,7 +31,7 @@ def without_negligible_effects(problem: SearchProblem, found: SearchResult, cont
     def conditions(name: str, model: Model, without: Fit) -> Alternatives:
         return ((Condition("selection.min_practical_size", practical_size(problem, model, without), min_size),),)
 
-    return _with_standing_effects(problem, found, conditions, control)
+    return _with_confirmed_effects(problem, found, conditions, control)
 
 
 def without_harmful_effects(
@@ -42,7 +42,7 @@ def without_harmful_effects(
     def conditions(name: str, model: Model, without: Fit) -> Alternatives:
         return held_out_conditions(held_out, without, model.fit, problem.settings.selection)
 
-    return _with_standing_effects(problem, found, conditions, control)
+    return _with_confirmed_effects(problem, found, conditions, control)
 
 
 def held_out_conditions(held_out: HeldOut, without: Fit, fit: Fit, settings: SelectionSettings) -> Alternatives:
@@ -80,7 +80,7 @@ def practical_size(problem: SearchProblem, model: Model, without: Fit) -> float:
     return float((difference / model.scale.sigma[-1]).max())
 
 
-def _with_standing_effects(
+def _with_confirmed_effects(
     problem: SearchProblem,
     found: SearchResult,
     conditions_of: Callable[[str, Model, Fit], Alternatives],
@@ -94,10 +94,10 @@ def _with_standing_effects(
             conditions = conditions_of(name, model, without.fit)
             removed[name] = (without, conditions, _margin(conditions))
         weakest = min(removed, key=lambda name: removed[name][2])
-        stands = removed[weakest][2] > 0.0
-        for name in removed if stands else (weakest,):
-            control.record(Decision("stand", name, removed[name][1], stands, len(model.effects)))
-        if stands:
+        confirmed = removed[weakest][2] > 0.0
+        for name in removed if confirmed else (weakest,):
+            control.record(Decision("confirm", name, removed[name][1], confirmed, len(model.effects)))
+        if confirmed:
             break
         numbers = ", ".join(f"{c.setting} {c.statistic:.3g}" for (c, *_) in removed[weakest][1])
         log.info("%s: withdrawn (%s)", weakest, numbers)
@@ -109,5 +109,5 @@ def _with_standing_effects(
 
 
 def _margin(alternatives: Alternatives) -> float:
-    """The best alternative's smallest excess of a statistic over its threshold; above 0 if the effect stands."""
+    """The best alternative's smallest excess of a statistic over its threshold; above 0 if it confirms the effect."""
     return max(min(c.statistic - c.threshold for c in conditions) for conditions in alternatives)

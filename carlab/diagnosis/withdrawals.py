@@ -21,7 +21,7 @@ REASONS: Mapping[str, str] = {
 """Reason of a failed test, by the first setting of its conditions."""
 REPLACED = REASONS["rivals.unnamed_ratio"]
 UNCONFIRMED = "a later test does not confirm it"
-TESTS_OF_ACCEPTED = ("support", "stand")
+TESTS_OF_ACCEPTED = ("support", "confirm")
 """Stages of decisions about accepted effects, after the search."""
 
 

@@ -67,7 +67,7 @@ def test_decisions_of_the_keep_stage_are_counted_separately() -> None:
 
 def test_one_alternative_is_sufficient_and_conditions_may_be_upper_bounds() -> None:
     below = [{"setting": "rivals.spurious_share", "statistic": 0.2, "threshold": 0.1, "above": False}]
-    made = decision("stand", "steering_lag", 10.0)
+    made = decision("confirm", "steering_lag", 10.0)
     made["alternatives"].append(below)
     assert not passes(made, CHI2, 20.0)
     assert passes(made, CHI2, 5.0)

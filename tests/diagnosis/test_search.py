@@ -125,7 +125,7 @@ def test_effect_that_raises_the_held_out_error_is_withdrawn(long_drag: Case, tmp
     """The cameras see the car turned in the fitted recording only."""
     outcome = found(long_drag, tmp_path, (0.02, 0.0), HALF)
     assert names(outcome) == [DRAG]
-    refused = [d for d in outcome.figure_data.decisions if not d.passed and d.stage == "stand"]
+    refused = [d for d in outcome.figure_data.decisions if not d.passed and d.stage == "confirm"]
     assert [(d.effect, d.alternatives[0][0].setting) for d in refused] == [
         (MISALIGNMENT, "selection.min_held_out_rise")
     ]

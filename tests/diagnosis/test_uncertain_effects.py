@@ -134,11 +134,11 @@ def test_effects_that_raise_both_held_out_errors_are_withdrawn(scored: ScoredSea
         is_larger = np.mean((after / STD) ** 2) >= np.mean((before / STD) ** 2)
         robust = np.maximum(1.4826 * np.median(np.abs(after), axis=0), 3.0 * STD)
         loss_before, loss_after = (huber_loss(4.0, each / robust).sum() for each in (before, after))
-        stands = not is_larger or loss_after < loss_before
+        is_confirmed = not is_larger or loss_after < loss_before
         held_out = HeldOut(windows, 3.0 * STD, Noise(STD, STD))
         confirmed = without_harmful_effects(problem, replace(scored.found, best=best), held_out, RunControl())
-        assert confirmed.effects == ((LAG, BRAKE) if stands else (LAG,))
-        outcomes.append(stands)
+        assert confirmed.effects == ((LAG, BRAKE) if is_confirmed else (LAG,))
+        outcomes.append(is_confirmed)
     assert min(outcomes.count(True), outcomes.count(False)) >= 2
 
 
@@ -173,7 +173,7 @@ def saturated() -> ScoredSearch:
     return ScoredSearch.of(problem, found, HeldOut(held_out, STD, Noise(STD, STD)))
 
 
-def test_limit_whose_interval_does_not_reach_the_end_of_its_range_stands(saturated: ScoredSearch) -> None:
+def test_limit_whose_interval_does_not_reach_the_end_of_its_range_is_confirmed(saturated: ScoredSearch) -> None:
     assert not saturated.is_joint
     decisions: list[Decision] = []
     assert without_uncertain_effects(saturated, RunControl(record=decisions.append)).found.effects == (SATURATION,)
@@ -196,7 +196,7 @@ def test_limit_that_may_be_infinite_is_withdrawn(saturated: ScoredSearch) -> Non
 
 
 @pytest.mark.parametrize(("inertia_std", "expected"), [(1e-3, np.inf), (1e3, 1.0)])
-def test_limit_stands_if_another_number_differs_from_its_identity(
+def test_limit_is_confirmed_if_another_number_differs_from_its_identity(
     saturated: ScoredSearch, inertia_std: float, expected: float
 ) -> None:
     """Slipping wheels with an inertia need no finite stiffness."""

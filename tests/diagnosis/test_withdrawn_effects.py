@@ -23,7 +23,7 @@ LESS_LIKELY = Condition("selection.min_held_out_z", -0.2, 0.0)
 
 
 def stand(effect: str, *alternatives: Condition, passed: bool) -> Decision:
-    return Decision("stand", effect, tuple((condition,) for condition in alternatives), passed)
+    return Decision("confirm", effect, tuple((condition,) for condition in alternatives), passed)
 
 
 def test_reason_is_that_of_the_last_failed_test() -> None:

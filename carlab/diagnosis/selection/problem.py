@@ -230,7 +230,7 @@ class RunControl:
         """Whether one of the alternatives holds for accepted effects (of ``count``); records this for each of them."""
         confirmed = passes(alternatives)
         for name in effects:
-            self.record(Decision("stand", name, alternatives, confirmed, count))
+            self.record(Decision("confirm", name, alternatives, confirmed, count))
         return confirmed
 
 

@@ -185,7 +185,7 @@ class RivalSettings:
     name."""
     min_explained_share_of_most: float = 0.85
     """Share of the refit's excess, in the loss with free initial states, from which ``spurious_share_of_most`` applies.
-    On development cases true effects explain more, and effects that stand for other physics less
+    On development cases true effects explain more, and effects that imitate other physics less
     (docs/decisions/0019)."""
     spurious_share_many: float = 0.3
     """The same for ``many_effects`` effects or more: such a car may also have physics outside the catalogue."""
