@@ -6,9 +6,7 @@ import math
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding
 from carlab.diagnosis.report.numbers import percent
-
-UNCERTAIN = 0.5
-"""Probability of a name below which a line states it."""
+from carlab.diagnosis.settings import REPORT
 
 
 def effect_lines(diagnosis: Diagnosis) -> list[str]:
@@ -23,7 +21,7 @@ def effect_lines(diagnosis: Diagnosis) -> list[str]:
 
 def _uncertainty(effect: EffectFinding) -> str:
     """That the name is uncertain; empty for a set, which the verdict states, and for a probable name."""
-    if effect.indistinguishable_from or effect.confidence >= UNCERTAIN:
+    if effect.indistinguishable_from or effect.confidence >= REPORT.certain_name:
         return ""
     return f"The name is uncertain (probability {percent(effect.confidence)})."
 

@@ -355,7 +355,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     text = "The simulator lacks physics that no effect of the catalogue explains"
     if diagnosis.search.effects:
         text = "The simulator lacks physics that none of the searched effects explains"
-    if explained_share(diagnosis, "refit", before="nominal") > 0.5:
+    if explained_share(diagnosis, "refit", before="nominal") > REPORT.min_parameter_share:
         text = f"{fitted_parameters(diagnosis)} {text.replace('lacks', 'also lacks')}"
     if not diagnosis.search.is_complete:
         text = "The search for effects did not finish, and it has not found what the simulator lacks"

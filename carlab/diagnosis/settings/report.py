@@ -20,6 +20,11 @@ class ReportSettings:
     filter_lag_ratio: float = 0.6
     """Smallest ratio of the total delays of steering and drive that a filter of the poses can explain. Filters of 30 to
     100 ms in simulated recordings give 0.8 to 0.97."""
+    min_parameter_share: float = 0.5
+    """If fitted parameters explain more than this share of the car file's squared excess, a verdict about unexplained
+    physics states them first."""
+    certain_name: float = 0.5
+    """Probability of a name below which the console states it: the name is then more likely wrong than correct."""
     max_traces: int = 3
     """Maximum number of held-out recordings in figures."""
     max_correlations: int = 3
