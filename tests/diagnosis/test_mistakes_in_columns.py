@@ -83,6 +83,13 @@ def test_velocities_filtered_in_the_world_frame_are_replaced(clean, time_constan
     np.testing.assert_allclose(fit.states[rows, VY], clean.states[rows, VY], atol=0.12)
 
 
+def test_a_comparison_replaces_velocities_of_all_recordings_or_of_none(clean, held):
+    """Otherwise a filter of one group would appear as a change of the car."""
+    for others, n_faults in (([held], 0), ([filtered_in_world(held, 0.1)], 1)):
+        _, _, faults = check([filtered_in_world(clean, 0.1)], others, NOMINAL, alike=True)
+        assert sum("the velocities were estimated from the pose" in fault.action for fault in faults) == n_faults
+
+
 def test_exchanged_command_columns_are_repaired(clean, held):
     fit, out, faults = check([with_sent(clean, exchange)], [with_sent(held, exchange)], NOMINAL)
     assert [(f.id, f.channel) for f in faults] == [("exchanged_columns", "steering, throttle")]

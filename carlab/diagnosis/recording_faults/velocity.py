@@ -37,14 +37,22 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
 
     Args:
         repairs: the recordings.
-        alike: whether early velocities, backward differences and nominal stamps are repaired only if all recordings
-            have them.
+        alike: whether filters in the world frame, early velocities, backward differences and nominal stamps are
+            repaired only if all recordings have them.
     """
     motions = {k: r.motion() for k, r in enumerate(repairs) if r.has_velocity_columns}
     motions = {k: m for k, m in motions.items() if comparable_rows(m, "vx").sum() >= MIN_COMPARED_ROWS}
     for k, motion in motions.items():
-        _check_columns(repairs[k], motion)
-    _replace_early(repairs, motions, alike=alike)
+        _check_frame(repairs[k], motion)
+    _estimate_from_pose(repairs, {k: _filter_in_world(repairs[k], m) for k, m in motions.items()}, alike=alike)
+    measured = {k: m for k, m in motions.items() if repairs[k].has_velocity_columns}
+    for k, motion in measured.items():
+        _check_scales(repairs[k], motion)
+        for channel in VELOCITY_CHANNELS:
+            _check_spikes(repairs[k], motion, channel)
+    measured = {k: m for k, m in motions.items() if repairs[k].has_velocity_columns}
+    early = {k: early_velocities(repairs[k].times_s, repairs[k].states, m) for k, m in measured.items()}
+    _estimate_from_pose(repairs, early, alike=alike)
     found = {k: _backward_differences(repairs[k], m) for k, m in motions.items()}
     late = {k: fault for k, fault in found.items() if fault is not None}
     if alike and len(late) < len(repairs):
@@ -61,46 +69,34 @@ def _backward_differences(repair: EpisodeRepair, motion: PoseMotion) -> Fault | 
     return backward_differences(repair.times_s, repair.states, repair.segment, motion)
 
 
-def _replace_early(repairs: Sequence[EpisodeRepair], motions: Mapping[int, PoseMotion], *, alike: bool) -> None:
-    """Estimate velocities from the pose where the columns precede it; ``alike`` as for ``check_velocities``."""
-    found = {
-        k: early_velocities(repairs[k].times_s, repairs[k].states, motion)
-        for k, motion in motions.items()
-        if repairs[k].has_velocity_columns
-    }
-    early = {k: fault for k, fault in found.items() if fault is not None}
-    if alike and len(early) < len(repairs):
+def _filter_in_world(repair: EpisodeRepair, motion: PoseMotion) -> Fault | None:
+    """The fault of velocities that were filtered in the world frame; backward differences have their own repair."""
+    fault = world_filtered_velocities(repair.times_s, repair.states, motion)
+    return None if fault is None or _backward_differences(repair, motion) is not None else fault
+
+
+def _estimate_from_pose(repairs: Sequence[EpisodeRepair], found: Mapping[int, Fault | None], *, alike: bool) -> None:
+    """Estimate velocities from the pose where a fault is ``found``; ``alike`` as for ``check_velocities``."""
+    faults = {k: fault for k, fault in found.items() if fault is not None}
+    if alike and len(faults) < len(repairs):
         return
-    for k, fault in early.items():
+    for k, fault in faults.items():
         repairs[k].has_velocity_columns = False
         repairs[k].repaired(fault, "the velocities were estimated from the pose")
 
 
-def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
-    """Frame and filter of the velocities, then scale and spikes of each column."""
-    _check_frame(repair, motion)
+def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
+    """Frame of the velocities, and a constant angle between them and the yaw."""
+    fault = wrong_velocity_frame(repair.times_s, repair.states[:, 3:5].T, motion, "body")
+    if fault is not None:
+        vx, vy = repair.states[:, 3:5].T
+        repair.states[:, 3], repair.states[:, 4] = to_body(vx, vy, motion.yaw_unwrapped)
+        repair.repaired(fault, "the velocities were rotated by the yaw")
     rotated = rotated_velocity(repair.states[:, 3:5].T, motion)
     if rotated is not None:  # If the yaw is wrong, the diagnosis finds it as mocap_yaw_misalignment.
         vx, vy = repair.states[:, 3:5].T.copy()
         repair.states[:, 3], repair.states[:, 4] = to_world(vx, vy, np.asarray(rotated.evidence["offset_rad"]))
         repair.repaired(rotated, "vx and vy were rotated back by that angle")
-    filtered = world_filtered_velocities(repair.times_s, repair.states, motion)
-    if filtered is not None and _backward_differences(repair, motion) is None:  # those have their own repair
-        repair.has_velocity_columns = False
-        repair.repaired(filtered, "the velocities were estimated from the pose")
-        return  # in vy, such a filter looks like a wrong sign or a factor
-    _check_scales(repair, motion)
-    for channel in VELOCITY_CHANNELS:
-        _check_spikes(repair, motion, channel)
-
-
-def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
-    fault = wrong_velocity_frame(repair.times_s, repair.states[:, 3:5].T, motion, "body")
-    if fault is None:
-        return
-    vx, vy = repair.states[:, 3:5].T
-    repair.states[:, 3], repair.states[:, 4] = to_body(vx, vy, motion.yaw_unwrapped)
-    repair.repaired(fault, "the velocities were rotated by the yaw")
 
 
 def _check_scales(repair: EpisodeRepair, motion: PoseMotion) -> None:
