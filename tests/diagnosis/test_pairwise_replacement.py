@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from carlab.diagnosis.identification.fit_parameters import with_effect
 from carlab.diagnosis.selection import pairwise_tests
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
-from carlab.diagnosis.selection.pairwise_tests import PairwiseResult, choose_confusable
+from carlab.diagnosis.selection.pairwise_tests import PairwiseResult, choose_confusable, compare_pairs
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import fit_base, refit
+from carlab.diagnosis.selection.refit import fit_base, refit, refit_candidate
+from carlab.diagnosis.selection.screening import screen_of
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -56,3 +58,22 @@ def test_indistinguishable_effect_within_its_range_replaces_one_at_a_bound() -> 
     assert chosen.effects == (DELAY,)
     assert pairs.indistinguishable[DELAY] == (LATENCY,)
     assert chosen.fit.values()[f"effects.{DELAY}.extra_delay"] == pytest.approx(-0.0085, abs=0.003)
+
+
+def test_sharp_limit_is_not_replaced_because_its_roundness_is_at_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sharp limit of the motor has the roundness 0, the lower bound. Here a controller predicts the same."""
+    limit, controller = "motor_saturation", "speed_controller"
+    car = SimulatorConfig(control_period_s=PERIOD_S)
+    sharp = with_effect(car, limit).with_values({f"effects.{limit}.force": 3.0, f"effects.{limit}.roundness": 0.0})
+    windows = cut_windows(segments_of([drive(sharp, 20.0, 1)]), 0.8, 0.6)
+    problem = SearchProblem(car, windows, np.full(6, 1e-2), np.full(6, 1e-2), {})
+    base = fit_base(problem)
+    fitted = refit_candidate(problem, base, screen_of(problem, base).score(limit)).fit
+    z = [0.0 if free.name.endswith(".roundness") else at for free, at in zip(fitted.free, fitted.z, strict=True)]
+    model = Model((limit,), replace(fitted, z=np.array(z)), base.scale)
+    assert model.fit.values()[f"effects.{limit}.roundness"] == 0.0
+    equal = Candidate(controller, base.fit, 1.0), problem.left_out_loss_of_free_states(model.fit, model.scale)
+    monkeypatch.setattr(pairwise_tests, "_fitted_alternatives", lambda *_: {limit: [equal]})
+    pairs = compare_pairs(problem, delete_each(problem, model, RunControl()), RunControl())
+    assert pairs.indistinguishable[limit] == (controller,)
+    assert not pairs.replacements

@@ -30,7 +30,7 @@ class PairwiseResult:
     chi2               twice the gain of the effect over its design effect
     indistinguishable  effects that left-out blocks do not distinguish from it, the nearest first
     replacements       for an effect: the confusable effect with the lowest loss on left-out blocks, if that is lower;
-                       for an effect at a bound of its range, an indistinguishable one that is within its range
+                       for an effect whose only number is at a bound, an indistinguishable one within its range
     """
 
     chi2: Mapping[str, float] = field(default_factory=dict)
@@ -97,9 +97,13 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
 
 
 def _is_at_bound(fit: Fit, effect: str) -> bool:
-    """Whether a number of an effect ended at a bound of its range."""
-    numbers = (each for each in zip(fit.free, fit.z, strict=True) if each[0].name.startswith(f"effects.{effect}."))
-    return any(not free.choice and float(free.value(z)) in (free.low, free.high) for free, z in numbers)
+    """Whether the only number of an effect ended at a bound of its range.
+
+    One of several numbers may be at a bound although the effect is true: a sharp limit has the roundness 0.
+    """
+    own = [each for each in zip(fit.free, fit.z, strict=True) if each[0].name.startswith(f"effects.{effect}.")]
+    numbers = [(free, z) for free, z in own if not free.choice]
+    return len(numbers) == 1 and all(float(free.value(z)) in (free.low, free.high) for free, z in numbers)
 
 
 def _fitted_alternatives(
