@@ -28,7 +28,10 @@ channels with a common share of the bias."""
 DELAY_CHANGES_PERIODS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Changes of the command delay [periods of the recording] with which the bias is simulated in addition."""
 MIN_RISE_OF_EXPLAINED_SHARE = 0.1
-"""A changed delay is used for a group of channels if it explains more of the measured differences by this share."""
+MIN_RISE_TIMES_WINDOWS = 10.0
+"""A changed delay is used for a group of channels if it explains more of the measured differences by this share, and if
+the explained share rises by at least the second number over the number of windows. With commands of other windows the
+best of the delays raises it by up to 4, and a different delay by 12 or more."""
 
 
 def as_recorded(windows: PredictionWindows) -> PredictionWindows:
@@ -59,7 +62,7 @@ def without_curvature_bias(windows: PredictionWindows, config: SimulatorConfig) 
     initial_states, remaining = windows.initial_states.copy(), windows.curvature_bias.copy()
     for group in _GROUPS:
         columns = list(chain.from_iterable(group))
-        delay = _best_delay([float(explained[columns].sum()) for _, explained in evidence])
+        delay = _best_delay([float(explained[columns].sum()) for _, explained in evidence], len(windows))
         (bias, difference), (share, _) = by_delay[delay], evidence[delay]
         initial_states[:, columns] -= (share * bias)[:, columns]
         remaining[:, columns] -= (share * difference)[:, columns]
@@ -75,10 +78,17 @@ def _command_delays_s(config: SimulatorConfig, period_s: float) -> FloatArray:
     return config.command_delay_s + changes_s[min(config.delays_s()) + changes_s >= 0.0]
 
 
-def _best_delay(explained: Sequence[float]) -> int:
-    """Index of the delay that explains most; 0, that of the simulator, unless another one explains clearly more."""
+def _best_delay(explained: Sequence[float], count: int) -> int:
+    """Index of the delay that explains most; 0, that of the simulator, unless another one explains clearly more.
+
+    Args:
+        explained: share that each delay explains, that of the simulator first.
+        count: number of windows.
+    """
     best = int(np.argmax(explained))
-    return best if explained[best] > (1.0 + MIN_RISE_OF_EXPLAINED_SHARE) * explained[0] else 0
+    rise = explained[best] - explained[0]
+    is_clear = rise > MIN_RISE_OF_EXPLAINED_SHARE * explained[0] and rise * count >= MIN_RISE_TIMES_WINDOWS
+    return best if is_clear else 0
 
 
 def _evidence(simulated: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
