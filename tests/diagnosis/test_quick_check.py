@@ -13,8 +13,8 @@ import pytest
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.state_estimator import fit_velocity
-from carlab.diagnosis.quick.conditions import find_conditions
-from carlab.diagnosis.quick.quick_check import QuickCheck, quick_check
+from carlab.diagnosis.quick.conditions import ErrorCondition, find_conditions
+from carlab.diagnosis.quick.quick_check import ChannelScore, QuickCheck, quick_check
 from carlab.diagnosis.quick.sentences import sentences, short
 from carlab.diagnosis.settings import QUICK
 from carlab.diagnosis.state_alignment import align_states, window_variance_s2
@@ -29,6 +29,19 @@ SIMULATOR = SimulatorConfig.from_preset()
 def recorded(folder: Path, true: SimulatorConfig, seed: int, episodes: int = 5) -> list[EpisodeData]:
     run = drives.drive_like_learning(true, folder, episodes, seed)
     return [read_episode(path) for path in run.recordings()]
+
+
+def test_condition_of_the_largest_error_is_a_clause() -> None:
+    channel = ChannelScore("x", 0.08, 0.001, "m")
+    clauses = {
+        "share of braking < 0.36": "mostly where share of braking < 0.36 (",
+        "lateral acceleration > 2 m/s2": "mostly where lateral acceleration > 2 m/s² (",
+        "driving backwards": "mostly driving backwards (",
+    }
+    for condition, clause in clauses.items():
+        found = ErrorCondition(condition, 77.0, 48.0, 10)
+        check = QuickCheck("left", score=35.0, channels=(channel,), conditions=(found,))
+        assert clause in sentences(check)[0]
 
 
 @pytest.mark.parametrize("seed", [20, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (21, 22))])

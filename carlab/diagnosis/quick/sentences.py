@@ -6,7 +6,7 @@ import math
 
 from carlab.diagnosis.quick.causes import ALL_PARAMETERS, GRIP, Cause
 from carlab.diagnosis.quick.quick_check import QuickCheck
-from carlab.diagnosis.report.numbers import number, percent, with_unit
+from carlab.diagnosis.report.numbers import number, percent, unit_text, with_unit
 from carlab.diagnosis.report.sentences import CHANNEL_NAMES
 from sim_backends.effects import EFFECTS
 
@@ -35,7 +35,7 @@ def sentences(check: QuickCheck, decide: str = "carlab diagnose decides") -> tup
     )
     if check.conditions:
         c = check.conditions[0]
-        where = f"where {c.text}" if c.text.startswith("|") else c.text
+        where = f"where {unit_text(c.text)}" if {"<", ">"} & set(c.text) else c.text
         text += f", mostly {where} ({c.inside:.1f} against {c.outside:.1f} noise floors)"
     else:
         text += ", equally in all driving conditions"
