@@ -28,10 +28,10 @@ channels with a common share of the bias."""
 DELAY_CHANGES_PERIODS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Changes of the command delay [periods of the recording] with which the bias is simulated in addition."""
 MIN_RISE_OF_EXPLAINED_SHARE = 0.1
+"""A changed delay is used for a group of channels if it explains more of the measured differences by this share."""
 MIN_RISE_TIMES_WINDOWS = 10.0
-"""A changed delay is used for a group of channels if it explains more of the measured differences by this share, and if
-the explained share rises by at least the second number over the number of windows. With commands of other windows the
-best of the delays raises it by up to 4, and a different delay by 12 or more."""
+"""Minimum rise of the explained share times the number of windows for a changed delay. By chance, with the commands of
+other windows, the best of all delays reaches 4; recordings with a clearly different delay have 12 and more."""
 
 
 def as_recorded(windows: PredictionWindows) -> PredictionWindows:

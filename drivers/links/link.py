@@ -32,7 +32,7 @@ class Link(Protocol[Written, Read]):
         """Send all bytes within the write time-out (unsent ones are discarded), or a frame at once; else raise."""
 
     def read(self) -> Read:
-        """Bytes (may be empty) or frames that have arrived, oldest first. Never blocks."""
+        """Bytes (may be empty) or frames that have arrived, oldest first. Does not block."""
 
     def fileno(self) -> int | None:
         """File descriptor that becomes readable when bytes or frames arrive; None if there is none."""

@@ -47,7 +47,7 @@ class Sender(ABC):
         self._last = SenderStatus()
 
     def post(self, order: Order) -> None:
-        """Publish the newest order and wake the sender; never blocks.
+        """Publish the newest order and wake the sender, without blocking.
 
         Errors are ignored, since the status shows an ended sender.
         """
@@ -56,10 +56,7 @@ class Sender(ABC):
             self.wake.send(b"\1")
 
     def status(self) -> SenderStatus:
-        """Newest status; the last one read if the slot is being written or another thread has closed it.
-
-        Never blocks.
-        """
+        """Newest status, without blocking; the last one read while the slot is being written or after it was closed."""
         with contextlib.suppress(ValueError):
             newest = self.statuses.read()
             if newest is not None:

@@ -35,13 +35,12 @@ from carlab.diagnosis.comparison.result import Change, Comparison, ComparisonVer
 from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.block_jackknife import clustered_gain
 from carlab.diagnosis.identification.fit import Fitter
-from carlab.diagnosis.recording_faults.find import with_unknown_delay
+from carlab.diagnosis.recording_faults.find import hide_delay
 from carlab.diagnosis.selection.problem import delays_all_commands
 from carlab.diagnosis.settings import COMPARISON
 from carlab.diagnosis.state_alignment import naming_lost_frames
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
-from sim_backends.measurement import COMMAND_DELAY
 from sim_backends.registry import REGISTRY
 
 
@@ -84,7 +83,7 @@ def compare(
         compared = compared_groups(reference, changed, nominal)
     screened = _screen(compared, candidates, progress, stop)
     changes, tested, is_complete = _select(compared, screened, progress, stop)
-    if COMMAND_DELAY in with_unknown_delay(nominal, compared.data_faults).unknown:
+    if hide_delay(compared.data_faults):
         changes = tuple(c for c in changes if c.id not in EFFECTS or not delays_all_commands(c.id))
     verdict: ComparisonVerdict = "changed" if changes else "nothing" if is_complete else "inconclusive"
     seconds = MonotonicClock().now_s() - began_s

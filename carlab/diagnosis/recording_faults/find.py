@@ -58,5 +58,9 @@ def check(
 
 def with_unknown_delay(config: SimulatorConfig, faults: Sequence[DataFault]) -> SimulatorConfig:
     """Mark the command delay as unknown if a clock offset hid it, so that it is fitted and no effect explains it."""
-    is_hidden = any(fault.id == "clock_offset" and fault.action.startswith("repaired") for fault in faults)
-    return replace(config, unknown=config.unknown | {COMMAND_DELAY}) if is_hidden else config
+    return replace(config, unknown=config.unknown | {COMMAND_DELAY}) if hide_delay(faults) else config
+
+
+def hide_delay(faults: Sequence[DataFault]) -> bool:
+    """Whether a clock offset was repaired, which hides the delay of the commands."""
+    return any(fault.id == "clock_offset" and fault.action.startswith("repaired") for fault in faults)

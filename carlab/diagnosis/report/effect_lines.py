@@ -21,7 +21,7 @@ def effect_lines(diagnosis: Diagnosis) -> list[str]:
 
 def _uncertainty(effect: EffectFinding) -> str:
     """That the name is uncertain; empty for a set, which the verdict states, and for a probable name."""
-    if effect.indistinguishable_from or effect.confidence >= REPORT.certain_name:
+    if effect.indistinguishable_from or effect.confidence >= REPORT.uncertain_probability:
         return ""
     return f"The name is uncertain (probability {percent(effect.confidence)})."
 

@@ -352,11 +352,10 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     if differs_when_held_out(diagnosis):
         return _different_when_held_out(diagnosis)
     rest = diagnosis.unexplained
-    text = "The simulator lacks physics that no effect of the catalogue explains"
-    if diagnosis.search.effects:
-        text = "The simulator lacks physics that none of the searched effects explains"
+    which = "none of the searched effects" if diagnosis.search.effects else "no effect of the catalogue"
+    text = f"The simulator lacks physics that {which} explains"
     if explained_share(diagnosis, "refit", before="nominal") > REPORT.min_parameter_share:
-        text = f"{fitted_parameters(diagnosis)} {text.replace('lacks', 'also lacks')}"
+        text = f"{fitted_parameters(diagnosis)} The simulator also lacks physics that {which} explains"
     if not diagnosis.search.is_complete:
         text = "The search for effects did not finish, and it has not found what the simulator lacks"
     if rest is None:

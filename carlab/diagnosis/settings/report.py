@@ -23,7 +23,7 @@ class ReportSettings:
     min_parameter_share: float = 0.5
     """If fitted parameters explain more than this share of the car file's squared excess, a verdict about unexplained
     physics states them first."""
-    certain_name: float = 0.5
+    uncertain_probability: float = 0.5
     """Probability of a name below which the console states it: the name is then more likely wrong than correct."""
     max_traces: int = 3
     """Maximum number of held-out recordings in figures."""
