@@ -9,6 +9,7 @@ from typing import Any
 
 from carlab.benchmark.effects.catalogue import CONFUSABLE
 from carlab.benchmark.proof.matching import Correctness, assigned
+from carlab.benchmark.proof.probabilities import stated_names
 from carlab.core.errors import DataError
 
 SCHEMA = "carlab.diagnosis/1"
@@ -62,6 +63,7 @@ def score_case(
     implied = answer.get("implied_effects", ())
     named = [dict(e) for e in report["effects"] if e["id"] not in implied] if report is not None else []
     row["named"] = [e["id"] for e in named]
+    row["stated_names"] = stated_names(named, row["true"])
     row["implied"] = list(implied)
     row["conditions"] = list(answer.get("conditions", ()))
     if answer["fault"] is not None:

@@ -7,12 +7,17 @@ from typing import Any
 
 from carlab.benchmark.baselines.scores import COLUMNS, comparison_rows
 from carlab.benchmark.proof.detection import BINS, curve_rows, detection_curves, spurious_curves
+from carlab.benchmark.proof.probabilities import bin_rows, brier_score, probability_bins
 from carlab.benchmark.proof.scores import per_effect, table_rows
 
 Row = Mapping[str, Any]
 DETECTION = (
     "Share of concealed effects that are named (at any rank, sets allowed) by the excess of each effect alone, with "
     "95 % Wilson intervals and counts."
+)
+PROBABILITIES = (
+    "Names of all reports by the probability that the report states, and the share that is correct. In a set of "
+    "indistinguishable effects only the first name counts. Brier score {:.3f}."
 )
 
 
@@ -46,6 +51,10 @@ def results_page(
     spurious = curve_rows(spurious_curves(rows.values()))
     if spurious:
         parts += ["Cases outside the catalogue with a spurious name:", markdown(("physics", *BINS), spurious)]
+    bins = probability_bins(rows.values())
+    if bins:
+        parts += ["## Stated probabilities", PROBABILITIES.format(brier_score(rows.values()))]
+        parts.append(markdown(("stated probability", "mean", "names that are correct", "n"), bin_rows(bins)))
     effects = [
         (name, f"{e['strict']}/{e['alone']}", f"{e['with_sets']}/{e['alone']}", f"{e['named']}/{e['cases']}")
         for name, e in per_effect(rows.values()).items()

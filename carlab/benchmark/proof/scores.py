@@ -16,6 +16,7 @@ from carlab.benchmark.effects.catalogue import EFFECT_IDS
 from carlab.benchmark.intervals import share_text, wilson
 from carlab.benchmark.proof.case_score import score_case
 from carlab.benchmark.proof.detection import detection_curves, spurious_curves
+from carlab.benchmark.proof.probabilities import brier_score, probability_bins
 
 Row = Mapping[str, Any]
 
@@ -163,6 +164,8 @@ def write_scores(
         "per_effect": per_effect(rows.values()),
         "detection": [asdict(curve) for curve in detection_curves(rows.values())],
         "spurious": [asdict(curve) for curve in spurious_curves(rows.values())],
+        "probabilities": [asdict(each) for each in probability_bins(rows.values())],
+        "brier_score": brier_score(rows.values()),
         "baselines": list(baselines),
     }
     path.write_text(json.dumps({**figures, "cases": dict(rows)}, indent=1) + "\n", encoding="utf-8")
