@@ -254,7 +254,9 @@ def _assemble_result(
 ) -> Outcome:
     """Compute evidence, unexplained residual, measured curves, ceiling, verdict and figure data."""
     held_out, progress = scored.held_out, control.progress
-    findings = effect_findings(scored, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share))
+    findings = effect_findings(
+        scored, request.effects is None, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share)
+    )
     share = unexplained_share(scored)
     unexplained, described = None, None
     if share >= EVIDENCE.unexplained_share_min:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.explained import explained_shares
 from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
 from carlab.diagnosis.identification.block_jackknife import clustered_gain, interval_quantile
 from carlab.diagnosis.identification.fit import Fit
@@ -75,16 +76,20 @@ def _refined(problem: SearchProblem, found: SearchResult) -> tuple[SearchResult,
 
 
 def effect_findings(
-    scored: ScoredSearch, progress: Callable[[float], None] = lambda share: None
+    scored: ScoredSearch, covers_catalogue: bool = True, progress: Callable[[float], None] = lambda share: None
 ) -> tuple[EffectFinding, ...]:
-    """Each accepted effect with its evidence, the strongest first; without its sentence and drive."""
+    """Each accepted effect with its evidence, the strongest first; without its sentence and drive.
+
+    If the search ``covers_catalogue``, what the effects leave unexplained is physics that names may imitate.
+    """
     if not scored.found.effects:
         return ()
+    explained = _explained_share(scored) if covers_catalogue else 1.0
     jacobian = scored.problem.fitter(scored.found.scale).linearised(scored.fit).jacobian
     found = []
     for k, name in enumerate(scored.found.effects):
         progress(k / len(scored.found.effects))
-        found.append(_finding(scored, name, jacobian))
+        found.append(_finding(scored, name, jacobian, explained))
     return tuple(found)
 
 
@@ -99,8 +104,18 @@ def scores_by_step(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
     return tuple(steps)
 
 
-def _finding(scored: ScoredSearch, name: str, jacobian: FloatArray) -> EffectFinding:
-    """An accepted effect; ``jacobian`` (n, S, U, 6) is that of the whitened errors at the fit."""
+def _explained_share(scored: ScoredSearch) -> float:
+    """The larger share of the refit's excess that the effects explain, in [0, 1]."""
+    shares = explained_shares(scored.problem, scored.found, scored.held_out)
+    return min(max(*shares, 0.0), 1.0) if shares is not None else 1.0
+
+
+def _finding(scored: ScoredSearch, name: str, jacobian: FloatArray, explained: float) -> EffectFinding:
+    """An accepted effect.
+
+    ``jacobian`` (n, S, U, 6) is that of the whitened errors at the fit, ``explained`` the share of the excess that all
+    effects explain.
+    """
     found, held_out, full = scored.found, scored.held_out, scored.errors["with_effects"]
     others = tuple(e for e in found.effects if e != name)
     without = refit(scored.problem, others, scored.fit, found.scale).fit
@@ -119,7 +134,7 @@ def _finding(scored: ScoredSearch, name: str, jacobian: FloatArray) -> EffectFin
     )
     return EffectFinding(
         id=name,
-        confidence=_confidence(scored, name) / (1 + len(others)),
+        confidence=explained * _confidence(scored, name) / (1 + len(others)),
         parameters=parameters,
         where=_where(scored, name, parameters, error, without),
         evidence=evidence,
@@ -130,7 +145,7 @@ def _finding(scored: ScoredSearch, name: str, jacobian: FloatArray) -> EffectFin
 
 
 def _confidence(scored: ScoredSearch, name: str) -> float:
-    """Probability that the name is right, by the logistic regression of the settings on the root of chi2."""
+    """Probability that the name is right if no other physics is missing: a logistic function of the root of chi2."""
     root = math.sqrt(max(scored.found.chi2[name], 1e-3))
     return float(1.0 / (1.0 + (EVIDENCE.confidence_half / root) ** EVIDENCE.confidence_slope))
 

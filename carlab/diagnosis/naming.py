@@ -16,9 +16,9 @@ import numpy as np
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.curves.curve_rival import RIVAL_CURVES, curve_in_addition, replacing_curve
 from carlab.diagnosis.decisions import Alternatives, Condition
+from carlab.diagnosis.explained import explained_loss_share, explained_shares
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.fit import Fit
-from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.correlated_errors import without_unsupported_effects
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
@@ -168,7 +168,7 @@ def _limits_in_addition(
     is_irrelevant = _is_irrelevant(problem, found, unnamed_gain)
     if len(found.effects) >= settings.many_effects:
         return (is_irrelevant,), (is_below("spurious_share_many"),)
-    explained = explained_share(problem, found, held_out)
+    explained = explained_loss_share(problem, found, held_out)
     explain_most = Condition("rivals.min_explained_share_of_most", explained, settings.min_explained_share_of_most)
     return (is_irrelevant,), (is_below("spurious_share"),), (is_below("spurious_share_of_most"), explain_most)
 
@@ -210,11 +210,11 @@ def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldO
     The strongest part of physics outside the catalogue often resembles an effect; the rest of it remains.
     """
     settings = problem.settings.rivals
-    before, after = (held_out.score(held_out.final_error(fit.config)) for fit in (found.base, found.best))
-    excess = before**2 - 1.0
-    if len(found.effects) >= settings.many_effects or excess <= settings.min_held_out_excess:
+    if len(found.effects) >= settings.many_effects:
         return False
-    shares = explained_share(problem, found, held_out), 1.0 - max(after**2 - 1.0, 0.0) / excess
+    shares = explained_shares(problem, found, held_out)
+    if shares is None:
+        return False
     alternatives = tuple(
         (Condition("rivals.min_explained_share", share, settings.min_explained_share),) for share in shares
     )
@@ -222,29 +222,6 @@ def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldO
     if little:
         log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), max(shares))
     return little
-
-
-def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldOut) -> float:
-    """Share of the refit's excess that the effects explain, over the fitted and the held-out windows.
-
-    The excess is the loss with free initial states minus that of a perfect simulator. Errors of initial states, which
-    hide most of a weak effect at the end of a window, do not enter it.
-    """
-    excess = []
-    for config in (found.base.config, found.best.config):
-        total = 0.0
-        for windows in (problem.windows, held_out.windows):
-            loss = loss_of_free_initial_states(
-                windows,
-                config,
-                (),
-                np.zeros((len(windows), 0)),
-                held_out.noise.measured,
-                max_error=problem.settings.selection.max_left_out_error,
-            )
-            total += float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)
-        excess.append(max(total, 0.0))
-    return 1.0 - excess[1] / excess[0] if excess[0] > 0.0 else 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,12 +9,12 @@ from scipy.optimize import least_squares
 
 import carlab
 from carlab.benchmark.cases.case import make_case
+from carlab.diagnosis.explained import explained_loss_share
 from carlab.diagnosis.identification.error_scale import Scale, huber
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise
-from carlab.diagnosis.naming import explained_share
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
@@ -85,7 +85,7 @@ def test_explained_share_is_the_excess_that_the_effects_remove(
 
     for share, expected in ((1.0, 0.0), (0.5, 0.75), (0.0, 1.0)):
         found = SearchResult(fitted(1.0), fitted(share), ("motor_lag",), {}, {}, (), (), Scale(np.ones(1), STD[None]))
-        assert explained_share(problem, found, held_out) == pytest.approx(expected, abs=0.03)
+        assert explained_loss_share(problem, found, held_out) == pytest.approx(expected, abs=0.03)
 
 
 @pytest.mark.slow
