@@ -20,7 +20,7 @@ from carlab.core.documents import SafetyEvent
 from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, CarlabError, ConfigError, NotArmedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.outcome import EndReason
-from carlab.core.quantities import NEUTRAL, Action, CarState, Observation
+from carlab.core.quantities import NEUTRAL, Action, CarState, Observation, PoseSample
 from carlab.core.safety_bounds import SAFETY_BOUNDS, Bound, check_bound
 
 FROZEN_POSITION_M, FROZEN_YAW_RAD = 2e-5, 1e-4
@@ -115,24 +115,40 @@ def limit(requested: Action, previous: Action, dt_s: float, envelope: SafetyEnve
     )
 
 
-def _moved(now: CarState, then: CarState) -> tuple[float, float]:
+def _moved(now: CarState | PoseSample, then: CarState | PoseSample) -> tuple[float, float]:
     """Distance [m] and angle [rad] between two poses."""
     return math.hypot(now.x_m - then.x_m, now.y_m - then.y_m), abs(float(wrap(now.yaw_rad - then.yaw_rad)))
 
 
+def _newest_pose(observation: Observation) -> PoseSample:
+    """The pose of the observation's state."""
+    o, state = observation, observation.state
+    return PoseSample(o.sequence, o.t_capture_s, o.t_receive_s, state.x_m, state.y_m, state.yaw_rad)
+
+
+def _is_valid(pose: PoseSample) -> bool:
+    """Whether a raw pose is tracked and finite; the estimator ignores others."""
+    return pose.tracked and all(map(math.isfinite, (pose.x_m, pose.y_m, pose.yaw_rad)))
+
+
 def pose_jump(observation: Observation, previous: Observation, envelope: SafetyEnvelope) -> str | None:
-    """Describe a pose change since ``previous`` that exceeds the car's speed or yaw rate; None if it is possible."""
-    then, now = previous.state, observation.state
-    dt_s = max(
-        observation.t_capture_s - previous.t_capture_s, observation.t_receive_s - previous.t_receive_s, 0.0
-    )  # Capture times alone fail after a step of the camera's clock, arrival times alone in a burst.
-    moved_m, turned_rad = _moved(now, then)
-    if (
-        moved_m <= envelope.max_speed_mps * dt_s + envelope.jump_margin_m
-        and turned_rad <= envelope.max_yaw_rate_radps * dt_s + envelope.jump_margin_rad
-    ):
-        return None
-    return f"It moved by {moved_m:.2f} m and turned by {turned_rad:.2f} rad within {dt_s * 1e3:.0f} ms."
+    """Describe a pose change since ``previous`` that exceeds the car's speed or yaw rate; None if it is possible.
+
+    Every pose between the observations is checked: a wrong one also falsifies the estimated speed.
+    """
+    then = _newest_pose(previous)
+    for now in (*filter(_is_valid, observation.poses), _newest_pose(observation)):
+        dt_s = max(
+            now.t_capture_s - then.t_capture_s, now.t_receive_s - then.t_receive_s, 0.0
+        )  # Capture times alone fail after a step of the camera's clock, arrival times alone in a burst.
+        moved_m, turned_rad = _moved(now, then)
+        if not (
+            moved_m <= envelope.max_speed_mps * dt_s + envelope.jump_margin_m
+            and turned_rad <= envelope.max_yaw_rate_radps * dt_s + envelope.jump_margin_rad
+        ):
+            return f"It moved by {moved_m:.3g} m and turned by {turned_rad:.2f} rad within {dt_s * 1e3:.0f} ms."
+        then = now
+    return None
 
 
 def violation(
