@@ -208,9 +208,10 @@ class HardwareCar(Car):
             self.pose_source.close()
 
     def _motor_is_turning(self) -> bool | None:
-        """Whether the measured motor speed exceeds the limit for arming; None if it is not measured."""
-        erpm = self.actuator.status().erpm
-        return None if math.isnan(erpm) else abs(erpm) > self.config.arm_max_erpm
+        """Whether the measured motor speed exceeds the limit for arming; None without fresh telemetry of it."""
+        status = self.actuator.status()
+        is_fresh = self.clock.now_s() - status.t_telemetry_s <= self.actuator.config.telemetry_stale_s
+        return abs(status.erpm) > self.config.arm_max_erpm if is_fresh and not math.isnan(status.erpm) else None
 
     def _await_poses(self) -> None:
         """Read poses until the speed can be estimated, ``ARM_WAIT_S`` at most."""

@@ -133,6 +133,18 @@ def test_observation_needs_a_tracked_pose_and_keeps_the_last_one(car: HardwareCa
     assert car.observe().poses == ()
 
 
+def test_motor_speed_of_stale_telemetry_is_unknown(serial_firmware: SerialFirmware, poses: ScriptedPoses) -> None:
+    """Otherwise a car that has stopped in neutral seems to have a frozen pose."""
+    serial_firmware.firmware.readings = lambda t_s: MotorValues(erpm=2000.0, fault_code=0)
+    config = HardwareConfig(patient_config(port=serial_firmware.port, telemetry_stale_s=0.5))
+    actuator = Actuator(config.actuator, config.calibration)
+    with HardwareCar("test car", actuator, poses, StateEstimator(), config=config) as car:
+        poses.show()
+        until(lambda: car.observe().motor_is_turning is True)
+        serial_firmware.faults.drops_replies = True
+        until(lambda: car.observe().motor_is_turning is None)
+
+
 def test_restarted_sequence_numbers_are_accepted(car: HardwareCar, poses: ScriptedPoses) -> None:
     poses.show(1.0, sequence=5000)
     car.observe()
