@@ -89,7 +89,14 @@ class RigidBodyPoseSource(Resource):
         self._is_open = True
 
     def _why_silent(self) -> str:
-        numbers = self._client.statistics()
+        numbers = self.statistics()
+        if numbers["untracked"]:
+            return f"the cameras do not see the body '{self._body_name}'; check its markers and the capture volume."
+        if numbers["unusable"]:
+            return (
+                f"every pose of the body '{self._body_name}' is invalid (NaN or no unit quaternion); restart streaming "
+                "in Motive."
+            )
         if numbers["frames"]:
             return f"frames arrive without the body '{self._body_name}'; enable it in Motive's Assets pane."
         if self._client.failure is not None or numbers["malformed"]:
@@ -302,10 +309,7 @@ def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBody
     """Select the rigid body of ``config``. Raises NotReadyError with a list of the available bodies."""
     bodies = _bodies(models)
     chosen = _matching_bodies(models, config)
-    if config.body_id is not None:
-        wanted = f"with id {config.body_id}"
-    else:
-        wanted = f"'{config.body}'" if config.body else "that is the only one"
+    wanted = f"'{config.body}'" if config.body_id is None else f"with id {config.body_id}"
     if chosen and len(sharing := [b.name for b in bodies if b.id == chosen[0].id]) > 1:
         raise NotReadyError(
             "No motion capture",
@@ -325,8 +329,14 @@ def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBody
                 f"one of {available}."
             ],
         )
+    remedy = f"set body in [hardware.mocap] (listen: --body) to one of {available}."
     if not bodies:
-        remedy = "it streams none: create one in Motive and switch Rigid Bodies on in the Data Streaming pane."
+        reason = (
+            "the server streams no rigid body; create one in Motive and switch Rigid Bodies on in the Data Streaming "
+            "pane."
+        )
+    elif config.body_id is None and not config.body:
+        reason = f"the server has several rigid bodies; {remedy}"
     else:
-        remedy = f"set body in [hardware.mocap] (listen: --body) to one of {available}."
-    raise NotReadyError("No motion capture", [f"the server has no rigid body {wanted}; {remedy}"])
+        reason = f"the server has no rigid body {wanted}; {remedy}"
+    raise NotReadyError("No motion capture", [reason])

@@ -269,7 +269,7 @@ def test_body_is_selected_by_name_or_id(serve: Serve, configure: Configure) -> N
     for choice, x_m in (({"body": "car"}, 1.0), ({"body": "trailer"}, 2.0), ({"body_id": 4}, 2.0)):
         with RigidBodyPoseSource(configure(server, **choice)) as source:
             assert pose(source.latest())[0] == x_m
-    for choice, named in (({"body": "truck"}, "'truck'"), ({"body_id": 77}, "77"), ({}, "the only one")):
+    for choice, named in (({"body": "truck"}, "'truck'"), ({"body_id": 77}, "77"), ({}, "several rigid bodies")):
         source = RigidBodyPoseSource(configure(server, **choice))
         with pytest.raises(NotReadyError) as caught:
             source.open()
@@ -279,7 +279,7 @@ def test_body_is_selected_by_name_or_id(serve: Serve, configure: Configure) -> N
 
 
 def test_missing_body_and_duplicate_names_are_reported() -> None:
-    with pytest.raises(NotReadyError, match="streams none: create one in Motive"):
+    with pytest.raises(NotReadyError, match="streams no rigid body; create one in Motive"):
         select_body((MarkerSetDescription("all", ()),), MocapConfig())
     twins = (RigidBodyDescription("car", 1), RigidBodyDescription("car", 2))
     with pytest.raises(NotReadyError, match="set body_id"):
