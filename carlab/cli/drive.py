@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,11 +15,12 @@ from tyro.conf import OmitArgPrefixes
 from carlab.api.drive_run import DriveRun
 from carlab.api.driving import EXCITATION, drive
 from carlab.api.runs import figure_names
-from carlab.cli.console import console, fail, progress, table
+from carlab.cli.console import console, fail, progress, table, warn
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
+from carlab.cli.neutral_warnings import neutral_warning
 from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
-from carlab.core.documents import Tick
+from carlab.core.documents import Document, SafetyEvent, Tick
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.core.outcome import EndReason
 from carlab.experiment.episodes.hooks import RunHooks
@@ -59,14 +62,18 @@ class Drive:
 
     def run(self) -> int:
         """Drive and print the results."""
+        events: defaultdict[int, list[SafetyEvent]] = defaultdict(list)
         with progress() as bar:
-            run = drive(**arguments_of(self, drive), hooks=self._hooks(bar))
-        return self._report(run)
+            run = drive(**arguments_of(self, drive), hooks=self._hooks(bar, events))
+        return self._report(run, events)
 
-    def _hooks(self, bar: Progress) -> RunHooks:
+    def _hooks(self, bar: Progress, events: defaultdict[int, list[SafetyEvent]]) -> RunHooks:
+        """Callbacks that show the progress and collect the events of each episode."""
         rows: list[TaskID] = []
+        numbers: list[int] = []
 
         def on_episode(number: int, ticks: int) -> None:
+            numbers.append(number)
             rows.append(bar.add_task(f"episode {number}", total=ticks, note=""))
 
         def on_tick(tick: Tick) -> None:
@@ -74,13 +81,17 @@ class Drive:
             note = f"({state.x_m:+.2f}, {state.y_m:+.2f}) m  {state.speed_mps:.2f} m/s"
             bar.update(rows[-1], completed=tick.step + 1, note=note)
 
-        return RunHooks(**common_hooks(bar), on_episode=on_episode, on_tick=on_tick)
+        def on_document(document: Document) -> None:
+            if isinstance(document, SafetyEvent):
+                events[numbers[-1]].append(document)
+
+        return RunHooks(**common_hooks(bar), on_episode=on_episode, on_tick=on_tick, on_document=on_document)
 
     def _has_task(self) -> bool:
         """Whether the figures of a task say something: a manoeuvre does not try to park."""
         return self.task.task is not None or self.policy not in (EXCITATION, "neutral", *MANOEUVRES)
 
-    def _report(self, run: DriveRun) -> int:
+    def _report(self, run: DriveRun, events: Mapping[int, list[SafetyEvent]]) -> int:
         results = run.episodes
         if not results:
             console.print("No episode was driven.")
@@ -98,6 +109,8 @@ class Drive:
         ]
         table("", ["episode", "ticks", *(["return"] if names else []), *(heading(n) for n in names), "end"], rows)
         for r in results:
+            if warning := neutral_warning(r.data, events.get(r.episode, [])):
+                warn(f"Episode {r.episode}: {warning}")
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
         complete = [r.path for r in results if r.has_recorded_ticks]
