@@ -48,15 +48,18 @@ STYLES = {Reality.SIMULATED: "cyan", Reality.EMULATED: "green", Reality.DRY_RUN:
 SENTENCES = {
     Reality.SIMULATED: "physics in this process; nothing can move",
     Reality.EMULATED: "real protocols, emulated firmware and motion capture; nothing can move",
-    Reality.DRY_RUN: "real inputs, no command is sent",
+    Reality.DRY_RUN: "real inputs; the car gets neutral only, which centres its servo",
     Reality.REAL: "A REAL CAR WILL MOVE. Keep clear, a hand on the power switch; ^C stops it",
 }
+
+CHECK_SENTENCE = "opened for a check; it gets neutral only, which centres its servo"
+"""Sentence for a real car that a verb does not drive."""
 
 
 def banner(reality: Reality, car: str, *, moves: bool = True) -> None:
     """Print the kind and name of the car; ``moves`` is False for a verb that does not move the car."""
     word = "LIVE" if reality is Reality.REAL else reality.value.upper()
-    sentence = SENTENCES[reality] if moves or reality is not Reality.REAL else "opened for a check; nothing will move"
+    sentence = SENTENCES[reality] if moves or reality is not Reality.REAL else CHECK_SENTENCE
     text = Text.assemble((word, "bold"), f"  {car}: {sentence}")
     console.print(Panel(text, style=STYLES[reality], expand=False))
 
