@@ -112,7 +112,7 @@ class Drive:
             if warning := neutral_warning(r.data, events.get(r.episode, [])):
                 warn(f"Episode {r.episode}: {warning}")
             if r.reason.is_safety_stop:
-                fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
+                fail(f"Episode {r.episode}: {r.reason.sentences(r.data.metadata['end_detail'])}")
         complete = [r.path for r in results if r.has_recorded_ticks]
         shown = " (summary.png shows it)" if run.picture.is_file() else ""
         unit = "tick" if any(r.path.exists() for r in results) else "episode"

@@ -163,7 +163,7 @@ class Replay:
         _print_difference(result.data, episode)
         console.print(f"Recorded in {result.path}")
         if result.reason.is_safety_stop:
-            fail(f"{result.reason.value} {result.data.metadata['end_detail']}".rstrip())
+            fail(result.reason.sentences(result.data.metadata["end_detail"]))
             return EXIT_SAFETY_STOP
         return EXIT_INTERRUPTED if result.reason is EndReason.STOP_REQUESTED else 0
 

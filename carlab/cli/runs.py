@@ -61,7 +61,7 @@ def common_hooks(bar: Progress) -> dict[str, Any]:
         banner(car.reality, car.name)
 
     def on_abandon(reason: EndReason, detail: str) -> None:
-        fail(f"{reason.value} {detail} The recording is in {folders[-1]}.")
+        fail(f"{reason.sentences(detail)} The recording is in {folders[-1]}.")
         os._exit(EXIT_SAFETY_STOP)
 
     place_by_hand = ask_to_place(bar, "use --no-place or a terminal")

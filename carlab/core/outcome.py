@@ -47,6 +47,10 @@ class EndReason(enum.Enum):
             EndReason.STOP_REQUESTED,
         )
 
+    def sentences(self, detail: str = "") -> str:
+        """The sentence for the user, with the detail as a sentence of its own."""
+        return f"{self.value} {detail[:1].upper()}{detail[1:]}".rstrip()
+
     def texts(self, detail: str = "") -> dict[str, str]:
         """Name, sentence and detail of this end, for the metadata of an episode."""
         return {"end_reason": self.name, "end_sentence": self.value, "end_detail": detail}

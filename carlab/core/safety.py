@@ -261,7 +261,7 @@ class SafetyStop(CarlabError):
     def __init__(self, reason: EndReason, detail: str) -> None:
         self.reason = reason
         self.detail = detail
-        super().__init__(f"{reason.value} {detail}".strip())
+        super().__init__(reason.sentences(detail))
 
 
 class SafeCar:
@@ -379,5 +379,5 @@ class SafeCar:
         self.stop(planned=False)
         if reason in POSE_REASONS and (problems := self.car.pose_problems()):
             detail = f"{detail} Motion capture reports: {' '.join(problems)}"
-        self._on_event(SafetyEvent(now_s, reason.name.lower(), f"{reason.value} {detail}"))
+        self._on_event(SafetyEvent(now_s, reason.name.lower(), reason.sentences(detail)))
         raise SafetyStop(reason, detail)

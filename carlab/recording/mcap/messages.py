@@ -90,7 +90,7 @@ def encode(item: Item, unix: UnixMapping, now_s: float) -> Iterator[Stamped]:
             if item.last is not None:
                 yield from _observation(item.last, item.steps, item.t_s, unix)
             level = logging.WARNING if item.reason.is_safety_stop else logging.INFO
-            sentence = f"{item.reason.name}: {item.reason.value} {item.detail}".rstrip()
+            sentence = f"{item.reason.name}: {item.reason.sentences(item.detail)}"
             yield _log(LogLine(unix.to_ns(item.t_s), level, "episode", sentence), item.t_s)
         case LogLine():
             yield _log(item, now_s)

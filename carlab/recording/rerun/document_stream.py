@@ -90,7 +90,7 @@ class DocumentStream:
                 self.flush()
                 self._step = item.steps
                 level = "WARN" if item.reason.is_safety_stop else "INFO"
-                self.text(look.END, f"{item.reason.name}: {item.reason.value} {item.detail}".rstrip(), level)
+                self.text(look.END, f"{item.reason.name}: {item.reason.sentences(item.detail)}", level)
 
     def overlay(self, name: str, states: FloatArray) -> None:
         """Write states (n, 6) of an additional car at the times of all rows so far; rows with NaN are omitted."""
