@@ -50,6 +50,9 @@ class ActuatorConfig:
         """Raise ConfigError for an unknown kind or inconsistent numbers."""
         if self.kind not in DEVICE_KINDS:
             raise ConfigError(f"kind of the actuator is {self.kind!r}; it must be one of {', '.join(DEVICE_KINDS)}.")
+        for name in ("interface", "channel") if self.device_kind.is_bus else ("port",):
+            if not getattr(self, name).strip():
+                raise ConfigError(f"'{name}' in [hardware.actuator] is empty; name the link to the actuator.")
         if not 10.0 <= self.rate_hz <= 500.0:
             raise ConfigError(f"rate_hz is {self.rate_hz:g}; it must lie in [10, 500].")
         if not 1.0 <= self.telemetry_rate_hz <= 200.0:

@@ -46,6 +46,8 @@ def car_file(folder: Path, table: str, *lines: str) -> Path:
         ("hardware.actuator", ["telemetry_stale_s = 250", "telemetry_lost_s = 1000"], "telemetry_stale_s .* most 2 s"),
         ("hardware.actuator", ["telemetry_lost_s = inf"], "telemetry_lost_s .* is inf"),
         ("hardware.actuator", ["open_timeout_s = inf"], "open_timeout_s"),
+        ("hardware.actuator", ['port = " "'], "'port' in .hardware.actuator. is empty; name the link"),
+        ("hardware.actuator", ['kind = "vesc_can"', 'channel = ""'], "'channel' in .hardware.actuator. is empty"),
         ("hardware.actuator", ["baud = 9600"], "baud .* is 9600; .* least 23000. Set a higher baud, also in the VESC"),
         ("hardware.actuator", ["baud = 43000", "rate_hz = 10", "telemetry_rate_hz = 200"], "at least 44000"),
         ("hardware", ["arm_max_erpm = nan"], "arm_max_erpm .* nan; give a finite number"),
