@@ -109,10 +109,10 @@ class Drive:
         ]
         table("", ["episode", "ticks", *(["return"] if names else []), *(heading(n) for n in names), "end"], rows)
         for r in results:
-            if warning := neutral_warning(r.data, events.get(r.episode, [])):
-                warn(f"Episode {r.episode}: {warning}")
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.sentences(r.data.metadata['end_detail'])}")
+            elif warning := neutral_warning(r.data, events.get(r.episode, [])):
+                warn(f"Episode {r.episode}: {warning}")
         complete = [r.path for r in results if r.has_recorded_ticks]
         shown = " (summary.png shows it)" if run.picture.is_file() else ""
         unit = "tick" if any(r.path.exists() for r in results) else "episode"
