@@ -49,10 +49,12 @@ class DryRunCar(Car):
     def command(self, action: Action) -> Action:
         """Check the action and return the action that would have been sent.
 
-        Raises NotOpenError, ActionOutOfRangeError and NotArmedError.
+        The wrapped car gets neutral, so a lost or faulty motor controller ends a dry run as it ends a drive. Raises
+        NotOpenError, ActionOutOfRangeError, NotArmedError and ActuatorFaultError.
         """
         self._require_open()
         self.check(action)
+        self.car.command(NEUTRAL)
         if not self._is_armed:
             if action.is_neutral:
                 return NEUTRAL

@@ -309,6 +309,20 @@ def test_place_is_passed_to_the_emulator_and_clears_old_poses(
         assert car.observe().state == CarState(2.0, 1.0, 0.5)
 
 
+def test_dry_run_ends_with_a_fault_of_the_motor_controller(
+    serial_firmware: SerialFirmware, poses: ScriptedPoses
+) -> None:
+    with DryRunCar(make_car(serial_firmware.port, poses)) as car:
+        poses.show()
+        car.arm()
+        assert car.command(Action(0.0, 0.1)) == Action(0.0, 0.1)
+        serial_firmware.firmware.fault_code = 2
+        until(lambda: not car.health().ready)
+        with pytest.raises(ActuatorFaultError, match="under-voltage"):
+            car.command(Action(0.0, 0.1))
+    assert all(e.value == 0.0 for e in serial_firmware.log.motor())
+
+
 def test_dry_run_observes_and_discards_commands(serial_firmware: SerialFirmware, poses: ScriptedPoses) -> None:
     inner = make_car(serial_firmware.port, poses)
     calibration = replace(inner.config.calibration)
