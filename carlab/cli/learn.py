@@ -16,7 +16,7 @@ from carlab.api.driving import drive
 from carlab.api.learn_request import RAY_WAIT_S, Device, Method, Particles
 from carlab.api.learning import LearnRun, learn
 from carlab.api.runs import figure_names
-from carlab.cli.console import console, progress, table
+from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
@@ -164,6 +164,11 @@ class Learn:
             console.print(f"All {done} episodes are driven; the run in {run.folder} is complete.", soft_wrap=True)
         if run.results:
             self._print_episodes(run)
+            last = run.results[-1]
+            # Without a person who places the car, any safety stop ends the run.
+            is_ended = last.reason not in CONTINUE_REASONS or (self.place is False and done < run.target_episodes)
+            if last.reason.is_safety_stop and is_ended:
+                fail(f"Episode {last.episode}: {last.reason.sentences(last.data.metadata['end_detail'])}")
             console.print(f"Learned and recorded in {run.folder} (learn.png, learn.rrd).", soft_wrap=True)
         if done < run.target_episodes:
             console.print(
@@ -172,13 +177,9 @@ class Learn:
                 f"{self.task.to_text()}{self.ray_text()}",
                 soft_wrap=True,
             )
-            last = run.end
-            return (
-                EXIT_SAFETY_STOP
-                if last is not None and last.is_safety_stop and last not in CONTINUE_REASONS
-                else EXIT_INTERRUPTED
-            )
-        return 0
+        if run.end is not None and run.end.is_safety_stop and run.end not in CONTINUE_REASONS:
+            return EXIT_SAFETY_STOP
+        return 0 if run.is_complete else EXIT_INTERRUPTED
 
     def ray_text(self) -> str:
         """The options of the cluster as command-line text, with a leading space; empty without a cluster."""
