@@ -51,7 +51,7 @@ FAULT_NAMES = {
 
 def fault_name(code: int) -> str:
     """Name of a fault code of the firmware."""
-    return FAULT_NAMES.get(code, f"code {code}")
+    return FAULT_NAMES.get(code, f"fault code {code}")
 
 
 def scaled_integer(value: float, scale: float, bits: int, name: str) -> int:

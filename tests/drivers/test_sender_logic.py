@@ -212,7 +212,11 @@ def test_stale_telemetry_gives_neutral_and_lost_telemetry_a_fault() -> None:
 
 @pytest.mark.parametrize(
     ("values", "text"),
-    [(MotorValues(fault_code=2), "under-voltage"), (MotorValues(status_bits=2), "kill switch")],
+    [
+        (MotorValues(fault_code=2), "under-voltage"),
+        (MotorValues(fault_code=77), "reports fault code 77;"),
+        (MotorValues(status_bits=2), "kill switch"),
+    ],
 )
 def test_firmware_faults_latch(values: MotorValues, text: str) -> None:
     bench = armed()
