@@ -172,9 +172,13 @@ class RunDirectory:
                     os.replace(file, self.stopped / file.name)
 
     def recordings(self, *, partial: bool = False) -> list[Path]:
-        """The complete MCAP recordings in order; with ``partial`` also the incomplete ones."""
+        """The complete MCAP recordings in order; with ``partial`` also the incomplete ones.
+
+        A file whose name is not the number of an episode, such as a copy, is no recording of the run.
+        """
         ends = (".mcap", ".mcap.partial") if partial else (".mcap",)
-        return sorted(entry for entry in self.episodes.iterdir() if entry.name.endswith(ends))
+        entries = [entry for entry in self.episodes.iterdir() if _EPISODE_FILE.fullmatch(entry.name)]
+        return sorted(entry for entry in entries if entry.name.endswith(ends))
 
     def log_handler(self) -> logging.Handler:
         """A logging handler that appends to log.jsonl; the caller adds, removes and closes it.

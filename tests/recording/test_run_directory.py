@@ -54,6 +54,14 @@ def test_next_episode_number_counts_finished_and_partial_files(tmp_path):
     assert [p.name for p in run.recordings(partial=True)] == ["0001.mcap", "0003.mcap.partial"]
 
 
+def test_file_without_the_number_of_an_episode_is_no_recording(tmp_path):
+    run = RunDirectory.create(tmp_path, "foreign")
+    for name in ("0001.mcap", "0001 (copy).mcap", "notes.mcap", "notes.mcap.partial", "0002.mcap"):
+        (run.episodes / name).touch()
+    for partial in (False, True):
+        assert [path.name for path in run.recordings(partial=partial)] == ["0001.mcap", "0002.mcap"]
+
+
 def test_log_has_one_json_object_per_line(tmp_path):
     run = RunDirectory.create(tmp_path, "log")
     handler = run.log_handler()
