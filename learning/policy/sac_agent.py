@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from carlab.core.errors import DataError, DivergedError
+from carlab.core.errors import CarlabError, DataError, DivergedError
 from carlab.core.observation import STATE_FEATURES
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action
@@ -98,6 +98,7 @@ class SacAgent:
         Raises:
             DivergedError: the policy diverged; the earlier policy is kept.
             DataError: the earlier policy has another observation space.
+            ConfigError: a reward or cost of the task is not finite; the earlier policy is kept.
         """
         earlier = self._sac
         sac = self._learner(env, earlier)
@@ -121,7 +122,8 @@ class SacAgent:
             sac.learn(UNLIMITED_STEPS, callback=callback, log_interval=UNLIMITED_STEPS, reset_num_timesteps=False)
         except BaseException as error:
             self._sac = earlier
-            if isinstance(error, ValueError) and "nan" in str(error):  # torch's distributions refuse NaN.
+            is_refusal = isinstance(error, ValueError) and not isinstance(error, CarlabError)
+            if is_refusal and "nan" in str(error):  # torch's distributions refuse NaN.
                 raise DivergedError(DIVERGED) from error
             raise
         if best.state is not None:

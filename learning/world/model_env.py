@@ -132,6 +132,9 @@ class ModelEnv(VecEnv):
         Returns:
             Policy inputs (cars, 7 + 2 H), rewards times ``REWARD_SCALE`` (cars,), mask of ended episodes (cars,), and
             one dictionary for each car.
+
+        Raises:
+            ConfigError: the task gives a reward or cost that is not finite in a plausible state.
         """
         before = self._features
         with torch.no_grad():
@@ -140,6 +143,7 @@ class ModelEnv(VecEnv):
             reward = self._task.reward(before, action, after)
             if self._bonus is not None:
                 reward = reward + self._bonus(after)
+            self._check_rewards(reward, before, after)
             reward = reward * REWARD_SCALE
         here = after.cpu()
         terminated = self._task.terminated(here).numpy() | self._stopped(here)
@@ -167,6 +171,9 @@ class ModelEnv(VecEnv):
 
         Returns:
             Unscaled return, constraint cost and final features of each episode.
+
+        Raises:
+            ConfigError: the task gives a reward or cost that is not finite in a plausible state.
         """
         self._start(np.arange(self.num_envs), training=False)
         total, cost = torch.zeros(self.num_envs), torch.zeros(self.num_envs)
@@ -178,8 +185,11 @@ class ModelEnv(VecEnv):
                 action = self._gate(before, torch.as_tensor(act(inputs)).to(self._device))
                 after = self._rollouts.step(before, action, self._generator)
                 here = after.cpu()
-                total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
-                cost += torch.where(ended, 0.0, self._task.cost(here))
+                reward, step_cost = self._task.reward(before, action, after), self._task.cost(here)
+                reward, step_cost = (torch.where(ended, 0.0, value) for value in (reward.cpu(), step_cost))
+                self._check_rewards(reward - step_cost, before, after)
+                total += reward
+                cost += step_cost
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
                 self._features, inputs = after, policy_inputs(here.numpy())
@@ -199,6 +209,26 @@ class ModelEnv(VecEnv):
         previous = torch.where(requested * previous < 0.0, 0.0, previous)
         slewed = torch.minimum(torch.maximum(requested, previous - self._slew), previous + self._slew)
         return torch.where(requested.abs() <= previous.abs(), requested, slewed)
+
+    def _check_rewards(self, rewards: Tensor, before: Tensor, after: Tensor) -> None:
+        """Raise ConfigError if a reward (cars,) is not finite although the car's state (cars, 7 + 2 H) is plausible.
+
+        A policy that is trained with such a reward diverges. States beyond the clip of the policy's inputs are those of
+        a learned car that has diverged.
+        """
+        if bool(torch.isfinite(rewards).all()):
+            return
+        features = np.stack([before.cpu().numpy(), after.cpu().numpy()])
+        plausible = (np.abs(policy_inputs(features)) < MAX_POLICY_INPUT).all(axis=(0, 2))
+        wrong = np.flatnonzero(plausible & ~torch.isfinite(rewards).cpu().numpy())
+        if not len(wrong):
+            return
+        x, y, yaw, vx, vy, yaw_rate = decode_state(after[int(wrong[0])].cpu()).tolist()
+        raise ConfigError(
+            f"The task {self._task.name} gives a reward or cost that is not finite, in the learned car at x {x:.3g} m, "
+            f"y {y:.3g} m, yaw {yaw:.3g} rad, vx {vx:.3g} m/s, vy {vy:.3g} m/s, yaw rate {yaw_rate:.3g} rad/s; avoid a "
+            "division by zero or a root of a negative number."
+        )
 
     def _stopped(self, features: Tensor) -> NDArray[np.bool_]:
         """Mask (cars,) of the cars that the gate stops: too fast, or unable to stop inside the arena; on the CPU."""

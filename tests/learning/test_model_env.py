@@ -11,11 +11,13 @@ import torch
 from terminating_parking import TerminatingParking
 from torch import Tensor
 
+from carlab.core.errors import ConfigError
 from carlab.core.geofence import can_stop_inside, rectangle
 from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafetyEnvelope, limit
 from carlab.core.task import ParkingTask
 from learning.policy.sac import FastSac
+from learning.policy.sac_agent import SacAgent, SacSettings
 from learning.world.model_env import REWARD_SCALE, ModelEnv, policy_inputs
 from tests.helpers.step_in_body import StepInBody
 
@@ -276,6 +278,53 @@ def test_rollout_ends_for_a_parked_car() -> None:
         )
         total, *_ = ModelEnv(StationaryCar(), at_goal, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
         assert total.tolist() == pytest.approx([ticks] * 3), "each tick is rewarded"
+
+
+class UndefinedReward(ParkingTask):
+    """A task whose reward is not a number from a speed of 1 m/s on."""
+
+    def reward(self, features, action, next_features):
+        return super().reward(features, action, next_features) * torch.sqrt(1.0 - next_features[..., 4])
+
+
+class FastCar(StationaryCar):
+    """A learned car that gains a given speed [m/s] in each step."""
+
+    def __init__(self, gain_mps: float) -> None:
+        self.gain_mps = gain_mps
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        return torch.tensor([0.0, 0.0, 0.0, self.gain_mps, 0.0, 0.0]).expand(len(inputs), 6)
+
+
+UNDEFINED_REWARD = r"gives a reward or cost that is not finite, in the learned car at .* vx 1.5 m/s"
+
+
+def test_reward_that_is_not_finite_in_a_plausible_state_is_an_error() -> None:
+    env = ModelEnv(FastCar(1.5), UndefinedReward(history_length=HISTORY), 2)
+    env.reset()
+    env.step_async(np.zeros((2, 2), dtype=np.float32))
+    with pytest.raises(ConfigError, match=UNDEFINED_REWARD):
+        env.step_wait()
+    with pytest.raises(ConfigError, match=UNDEFINED_REWARD):
+        env.roll_out(lambda seen: np.zeros((2, 2), dtype=np.float32))
+
+
+def test_reward_in_a_learned_car_that_has_diverged_is_no_error_of_the_task() -> None:
+    env = ModelEnv(FastCar(1e6), UndefinedReward(history_length=HISTORY), 2)
+    env.reset()
+    env.step_async(np.zeros((2, 2), dtype=np.float32))
+    _, rewards, ended, _ = env.step_wait()
+    assert np.isnan(rewards).all()
+    assert ended.all()
+
+
+def test_error_of_the_task_in_training_is_no_divergence() -> None:
+    task = UndefinedReward(history_length=HISTORY)
+    object.__setattr__(task, "name", "manoeuvre_nan")
+    agent = SacAgent(SacSettings(hidden=(8,), cars=4, warm_up=8), seed=0)
+    with pytest.raises(ConfigError, match="The task manoeuvre_nan gives a reward or cost that is not finite"):
+        agent.train(ModelEnv(FastCar(1.5), task, 4), 1)
 
 
 @dataclass(frozen=True)
