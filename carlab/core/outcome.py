@@ -28,7 +28,9 @@ class EndReason(enum.Enum):
     TRACKING_LOST = "Motion capture lost the body; check the markers and the capture volume."
     NOT_READY = "The car could not be armed and was not driven; see the reasons and start again."
     ACTUATOR_FAULT = "The actuator link or its firmware failed; check power, cable and the log, then start again."
-    LATE_LOOP = "Too many ticks were late; close other programs or lengthen control_period."
+    LATE_LOOP = (
+        "Too many ticks were late; close other programs, make a slow policy or task faster, or lengthen control_period."
+    )
     BAD_COMMAND = "The policy returned a command that is not a number; retrain it or use an earlier policy."
     POLICY_ERROR = "The policy raised an error; see the log."
     TASK_ERROR = "The task raised an error or gave a reward that is not a number; correct its file."

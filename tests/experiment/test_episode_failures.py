@@ -237,6 +237,27 @@ def test_slow_policy_ends_with_late_loop_and_not_with_a_pose_fault() -> None:
     assert injector.calls["command"] == 0, "the late command was not sent"
 
 
+class SlowTask(ParkingTask):
+    """A task whose reward takes 50 ms on the clock of the car."""
+
+    def __init__(self, car: SimulatedCar) -> None:
+        super().__init__()
+        object.__setattr__(self, "car", car)
+
+    def reward(self, features: Any, action: Any, next_features: Any) -> Any:
+        self.car.clock.sleep_until(self.car.clock.now_s() + 0.05)
+        return super().reward(features, action, next_features)
+
+
+def test_late_loop_states_the_times_of_policy_and_task() -> None:
+    with FaultyCar(FaultInjector()) as car:
+        policy = FaultyPolicy(car.injector, lambda view: Action())
+        data = drive_episode(car, policy, SlowTask(car), max_ticks=100)
+    assert data.metadata["end_reason"] == "LATE_LOOP"
+    assert "A tick has 33 ms; the median computation time of the policy was 0.0 ms" in data.metadata["end_detail"]
+    assert data.metadata["end_detail"].endswith("that of the task's functions 50.0 ms.")
+
+
 class BlindCar(FaultyCar):
     """Raises PoseLostError until ``until_s``, or returns observations with the given changes."""
 

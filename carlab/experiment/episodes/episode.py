@@ -96,10 +96,23 @@ class _LateTicks:
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._late: deque[bool] = deque(maxlen=LATE_WINDOW_TICKS)
+        self._policy_s: deque[float] = deque(maxlen=LATE_WINDOW_TICKS)
+        self._task_s: deque[float] = deque(maxlen=LATE_WINDOW_TICKS)
 
-    def add(self, timing: TickTiming) -> bool:
+    def add(self, timing: TickTiming, policy_s: float, task_s: float) -> bool:
+        """Add a tick with the computation times of policy and task [s]; whether the loop is late."""
         self._late.append(timing.late_s > 0.5 * self._period_s or timing.skipped > 0)
+        self._policy_s.append(policy_s)
+        self._task_s.append(task_s)
         return len(self._late) == LATE_WINDOW_TICKS and sum(self._late) > LATE_WINDOW_TICKS // 2
+
+    def describe(self, skipped: int) -> str:
+        """The number of skipped ticks, and the median computation times of policy and task."""
+        policy_ms, task_ms = (1e3 * float(np.median(times)) for times in (self._policy_s, self._task_s))
+        return (
+            f"{skipped} ticks were skipped. A tick has {1e3 * self._period_s:.0f} ms; the median computation time of "
+            f"the policy was {policy_ms:.1f} ms, that of the task's functions {task_ms:.1f} ms."
+        )
 
 
 class _End(Exception):
@@ -244,7 +257,9 @@ def _drive(
         timing = pacer.wait()
         now_s, observation = _observe(car, rows, hooks)
         next_features = encode(observation.state.to_array(), history.rows)
+        began_s = car.clock.now_s()
         reward, terminated, success = _evaluate_transition(task, features, sent, next_features)
+        task_s = car.clock.now_s() - began_s
         rows.add_step(requested, sent, reward)
         rows.add_observation(now_s, observation)
         truncated = step + 1 == ticks and not terminated
@@ -252,8 +267,8 @@ def _drive(
         features = next_features
         if terminated:
             return EndReason.GOAL_REACHED if success else EndReason.TASK_ENDED
-        if late.add(timing):
-            raise _End(EndReason.LATE_LOOP, f"{pacer.skipped} ticks were skipped.")
+        if late.add(timing, policy_s, task_s):
+            raise _End(EndReason.LATE_LOOP, late.describe(pacer.skipped))
     return EndReason.COMPLETED
 
 
