@@ -10,6 +10,7 @@ from typing import Any
 
 import tomli_w
 
+from carlab.core.car import Car
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import as_polygon
 from carlab.core.recording_noise import RecordingNoise
@@ -98,6 +99,11 @@ def read_car(car: str | Path | CarFile, option: str = "--car") -> CarFile:
     """
     if isinstance(car, CarFile):
         return car
+    if isinstance(car, Car):
+        raise ConfigError(
+            f"{option}: a car of your own class {type(car).__name__} has no car file; register a function that makes "
+            'it in the entry-point group carlab.cars, and give the name of the entry point (see "Add a car").'
+        )
     if not isinstance(car, (str, Path)):
         raise ConfigError(
             f"{option}: an object of type {type(car).__name__} is no car; give a name, the path of a car file, or the "

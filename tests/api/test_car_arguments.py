@@ -10,6 +10,7 @@ import pytest
 
 import carlab
 from carlab.core.errors import ConfigError
+from sim_backends.simulated_car import SimulatedCar
 
 
 @pytest.fixture
@@ -42,6 +43,12 @@ def test_value_of_another_type_is_refused(tmp_path: Path, option: str) -> None:
     arguments: dict[str, Any] = {"car": "sim"} | {option: 5}
     with pytest.raises(ConfigError, match=f"--{option}: an object of type int is no car; give a name"):
         carlab.drive(**arguments, ticks=2, out=tmp_path)
+
+
+def test_car_object_is_refused_with_the_entry_point_group() -> None:
+    car: Any = SimulatedCar()
+    with pytest.raises(ConfigError, match=r"own class SimulatedCar .* entry-point group carlab.cars"):
+        carlab.drive(car, ticks=2)
 
 
 def test_simulator_of_a_car_file_is_no_car() -> None:
