@@ -1,12 +1,21 @@
 """The report states faults of the recording that look like physics: limited commands, stamps and filtered poses."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from carlab.diagnosis.findings import DataFault, EffectFinding
+from carlab.diagnosis.findings import DataFault, Diagnosis, EffectFinding
 from carlab.diagnosis.report.recording_causes import recording_causes
-from tests.diagnosis.report_material import changed, estimate, lag_finding, mismatch, unexplained_physics
+from tests.diagnosis.report_material import (
+    changed,
+    estimate,
+    lag_finding,
+    mismatch,
+    no_mismatch,
+    parameters_only,
+    unexplained_physics,
+)
 
 LIMITED = DataFault("limited_commands", "steering", 900, "reported: the log or the radio limits the command.")
 
@@ -55,6 +64,22 @@ def test_latency_counts_in_addition_to_that_of_the_car_file() -> None:
     known = changed(mismatch(), effects=effects, car_file_parameters={"mocap.latency": 0.049})
     assert recording_causes(known) == ""
     assert "The steering is 0.07 s late and the drive 0.05 s." in recording_causes(changed(mismatch(), effects=effects))
+
+
+@pytest.mark.parametrize("make", [mismatch, no_mismatch, parameters_only])
+def test_fitted_latency_far_above_its_prior_is_stated(make: Callable[[], Diagnosis]) -> None:
+    """Only a delay of the commands can be so long; no effect explains it, because the latency does."""
+    delay = {"timing.command_delay": 0.03}
+    late = {"mocap.latency": estimate(0.056, 0.0002, "s")}
+    sentence = changed(make(), parameters=late, car_file_parameters=delay).sentence
+    assert "The poses are 0.056 s late (mocap.latency, which the car file does not state)." in sentence
+    assert "A command delay of 0.078 s, not 0.03 s as in the car file," in sentence
+    usual = {"mocap.latency": estimate(0.02, 0.0002, "s")}
+    assert "late (mocap.latency" not in changed(make(), parameters=usual, car_file_parameters=delay).sentence
+    stated = delay | {"mocap.latency": 0.055}
+    assert "late (mocap.latency" not in changed(make(), parameters=late, car_file_parameters=stated).sentence
+    hidden = late | {"timing.command_delay": estimate(0.05, 0.001, "s")}
+    assert "late (mocap.latency" not in changed(make(), parameters=hidden, car_file_parameters=delay).sentence
 
 
 def test_limited_commands_replace_the_class_of_missing_physics() -> None:

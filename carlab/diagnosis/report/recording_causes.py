@@ -5,16 +5,21 @@ from __future__ import annotations
 from carlab.diagnosis.findings import Diagnosis, EffectFinding
 from carlab.diagnosis.report.numbers import listed, with_unit
 from carlab.diagnosis.report.residual import is_above_noise
-from carlab.diagnosis.settings import REPORT
+from carlab.diagnosis.settings import IDENTIFICATION, REPORT
 from sim_backends.effects import EFFECTS
+from sim_backends.measurement import COMMAND_DELAY, LATENCY
+from sim_backends.registry import REGISTRY
 
 LIMITED, FRAME_RATE = "limited_commands", "wrong_frame_rate"
 """Ids of faults."""
 
 
 def recording_causes(diagnosis: Diagnosis) -> str:
-    """Sentences, each after a space, about limited commands, stamps and filtered poses; empty without these."""
-    return f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{_filtered_poses(diagnosis)}"
+    """Sentences, each after a space, about limited commands, stamps, late and filtered poses; empty without these."""
+    return (
+        f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{_late_poses(diagnosis)}"
+        f"{_filtered_poses(diagnosis)}"
+    )
 
 
 def limited_channels(diagnosis: Diagnosis) -> list[str]:
@@ -46,6 +51,27 @@ def _wrong_frame_rate(diagnosis: Diagnosis) -> str:
     return (
         " The stamps probably have a wrong frame rate, which changes all forces and delays: compare the length of the "
         "recording with a clock before anything else."
+    )
+
+
+def _late_poses(diagnosis: Diagnosis) -> str:
+    """That the fitted latency contains another delay, if it is longer than the prior makes probable.
+
+    No effect explains such a delay, because the fit of a latency that the car file does not state contains it.
+    """
+    found, delay_s = diagnosis.parameters.get(LATENCY), diagnosis.car_file_parameters.get(COMMAND_DELAY)
+    if found is None or delay_s is None or LATENCY in diagnosis.car_file_parameters:
+        return ""
+    if COMMAND_DELAY in diagnosis.parameters:  # a repaired clock offset, which hides the delay
+        return ""
+    expected_s = REGISTRY[LATENCY].default
+    if found.value - expected_s <= REPORT.latency_z_max * IDENTIFICATION.latency_std_s:
+        return ""
+    return (
+        f" The poses are {with_unit(found.value, 's')} late (mocap.latency, which the car file does not state). A "
+        f"command delay of {with_unit(delay_s + found.value - expected_s, 's')}, not {with_unit(delay_s, 's')} as in "
+        f"the car file, with a latency of {with_unit(expected_s, 's')} looks the same. Measure one of both and state "
+        "both in the car file."
     )
 
 

@@ -20,6 +20,9 @@ class ReportSettings:
     filter_lag_ratio: float = 0.6
     """Smallest ratio of the total delays of steering and drive that a filter of the poses can explain. Filters of 30 to
     100 ms in simulated recordings give 0.8 to 0.97."""
+    latency_z_max: float = 1.6449
+    """Largest fitted latency above its prior mean without a sentence about it [standard deviations of the prior]: 5 %
+    of the prior are above."""
     min_parameter_share: float = 0.5
     """If fitted parameters explain more than this share of the car file's squared excess, a verdict about unexplained
     physics states them first."""
