@@ -196,6 +196,18 @@ def test_physics_of_the_fitted_recordings_alone_is_not_denied() -> None:
     assert "On the fitted recordings" in verdict_sentence(replace(mixed, verdict="parameters"))
 
 
+@pytest.mark.parametrize("residual", [None, REST])
+def test_effects_that_explain_the_fitted_recordings_lack_no_physics_there(residual: Unexplained | None) -> None:
+    """For example, play in the steering has errors in the first windows of a held-out drive, which have no history."""
+    found = replace(diagnosis("mismatch", 12.9, with_effects=2.1), unexplained=residual, fitted_score=0.9)
+    sentence = verdict_sentence(found)
+    assert "On the fitted recordings, this error is 0.9 noise floors: the held-out recordings have" in sentence
+    assert "the diagnosis does not find" not in sentence
+    lacking = verdict_sentence(replace(found, fitted_score=1.9))
+    assert "On the fitted recordings" not in lacking
+    assert ("the diagnosis does not find" in lacking) is (residual is None)
+
+
 def test_ceiling_without_an_excess_has_a_sentence() -> None:
     without = diagnosis("none", 0.8, black_box=16.0)
     assert ceiling_sentence(without) == "The refit has no error above the noise floor, so nothing is left to predict."

@@ -64,9 +64,14 @@ def is_above_noise(diagnosis: Diagnosis, model: str) -> bool:
     return held is not None and held.score > REPORT.score_above_noise
 
 
+def agrees_when_fitted(diagnosis: Diagnosis) -> bool:
+    """Whether the model with the named effects, if any, explains the fitted recordings to near their noise."""
+    return diagnosis.fitted_score < EVIDENCE.unexplained_score_min
+
+
 def differs_when_held_out(diagnosis: Diagnosis) -> bool:
     """Whether a model without effects explains the fitted recordings, but not the held-out ones."""
-    return diagnosis.verdict == "unexplained" and diagnosis.fitted_score < EVIDENCE.unexplained_score_min
+    return diagnosis.verdict == "unexplained" and agrees_when_fitted(diagnosis)
 
 
 def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:

@@ -15,6 +15,7 @@ from carlab.diagnosis.report.numbers import listed, number, unit_text, with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, fitted_parameters, late_commands, parameters_at_limit
 from carlab.diagnosis.report.recording_causes import limited_channels, recording_causes
 from carlab.diagnosis.report.residual import (
+    agrees_when_fitted,
     differs_when_held_out,
     error_fall,
     explained_share,
@@ -288,9 +289,10 @@ def _mismatch(diagnosis: Diagnosis) -> str:
         named = "it" if len(effects) == 1 else "them"
         named = "corrected numbers" if effects and all(e.car_file_values for e in effects) else named
         text += f" With {named}, {fall}{explanation(diagnosis)}."
-    if (rest := relevant_residual(diagnosis)) is not None:
-        return f"{text}{remainder(rest)}"
-    return f"{text}{_warning_above_noise(diagnosis, 'with_effects')}"
+    rest = remainder(found) if (found := relevant_residual(diagnosis)) is not None else ""
+    if not rest or agrees_when_fitted(diagnosis):
+        return f"{text}{rest}{_warning_above_noise(diagnosis, 'with_effects')}"
+    return f"{text}{rest}"
 
 
 def _statements(effects: Sequence[EffectFinding]) -> list[str]:
@@ -317,6 +319,11 @@ def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
     """A warning if the score stays well above the noise floor; else empty."""
     if not is_above_noise(diagnosis, which):
         return ""
+    if which != "nominal" and agrees_when_fitted(diagnosis):
+        return (
+            f" On the fitted recordings, this error is {number(diagnosis.fitted_score)} noise floors: the held-out "
+            "recordings have conditions that the fitted ones lack, or the car changed between them."
+        )
     return " This error is above the noise: the simulator lacks physics that the diagnosis does not find."
 
 
