@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from carlab.diagnosis.findings import FitErrors, Unexplained
+from carlab.diagnosis.findings import Estimate, FitErrors, Unexplained
 from carlab.diagnosis.report.effect_lines import effect_lines
 from carlab.diagnosis.report.next_drive import with_texts
 from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
@@ -23,6 +23,9 @@ def test_wrong_parameters_come_before_a_small_residual() -> None:
         "position error on held-out recordings after 1 s goes from 0.1 m to 0.1 m (all channels: from 6 to 1.4 noise "
         "floors). The simulator also lacks physics that no effect of the catalogue explains."
     )
+    refit = FitErrors(0.1, 0.1, 0.1, 0.1, 0.1, 2.5)
+    partly = verdict_sentence(replace(whole, held_out={**whole.held_out, "refit": refit}))
+    assert "tyre.front.mu is 0.42 (car file: 0.62) (these values may compensate for missing physics)." in partly
     refit = FitErrors(0.1, 0.1, 0.1, 0.1, 0.1, 5.0)
     little = replace(whole, held_out={**whole.held_out, "refit": refit})
     assert verdict_sentence(little).startswith("The simulator lacks physics that no effect of the catalogue explains.")
@@ -55,6 +58,20 @@ def test_line_of_an_improbable_name_states_its_probability() -> None:
     lines = [effect_lines(with_texts(diagnosis("mismatch", each)))[0] for each in (probable, improbable, in_set)]
     stated = [line.endswith(" The name is uncertain (probability 10 %).") for line in lines]
     assert stated == [False, True, False]
+    assert lines[2].endswith(" Probably none of these names is correct (probability of one: 20 %).")
+    likely_set = replace(in_set, confidence=0.3)
+    assert "Probably none" not in effect_lines(with_texts(diagnosis("mismatch", likely_set)))[0]
+
+
+def test_line_states_that_an_effect_may_be_absent() -> None:
+    damping = finding("yaw_damping")
+    (present,) = effect_lines(with_texts(diagnosis("mismatch", damping)))
+    absent = replace(damping, parameters={"coefficient": Estimate(0.012, 0.01, 0.0, 0.029, "N m s/rad")})
+    (uncertain,) = effect_lines(with_texts(diagnosis("mismatch", absent)))
+    assert uncertain.endswith(" The interval contains a car without the effect.")
+    assert "without the effect" not in present
+    stated = replace(absent, car_file_values={"coefficient": 0.05})
+    assert "without the effect" not in effect_lines(with_texts(diagnosis("mismatch", stated)))[0]
 
 
 def test_effects_that_raise_the_score_explain_no_negative_share() -> None:

@@ -7,10 +7,11 @@ import math
 from carlab.diagnosis.findings import Diagnosis, EffectFinding
 from carlab.diagnosis.report.numbers import percent
 from carlab.diagnosis.settings import REPORT
+from sim_backends.effects import EFFECTS
 
 
 def effect_lines(diagnosis: Diagnosis) -> list[str]:
-    """The sentence of each effect, and whether its name is uncertain.
+    """The sentence of each effect, and whether its name or the effect itself is uncertain.
 
     With several effects, also how much each one lowers the error; with a single effect the verdict states that.
     """
@@ -20,10 +21,25 @@ def effect_lines(diagnosis: Diagnosis) -> list[str]:
 
 
 def _uncertainty(effect: EffectFinding) -> str:
-    """That the name is uncertain; empty for a set, which the verdict states, and for a probable name."""
-    if effect.indistinguishable_from or effect.confidence >= REPORT.uncertain_probability:
-        return ""
-    return f"The name is uncertain (probability {percent(effect.confidence)})."
+    """That a name or all names of a set are improbable, or that the effect may be absent; else empty."""
+    count = 1 + len(effect.indistinguishable_from)
+    probability = count * effect.confidence  # a set shares the probability that its effect is correct
+    sentences = []
+    if probability < REPORT.uncertain_probability and count == 1:
+        sentences.append(f"The name is uncertain (probability {percent(probability)}).")
+    elif probability < REPORT.uncertain_probability:
+        sentences.append(f"Probably none of these names is correct (probability of one: {percent(probability)}).")
+    if _may_be_absent(effect):
+        sentences.append("The interval contains a car without the effect.")
+    return " ".join(sentences)
+
+
+def _may_be_absent(effect: EffectFinding) -> bool:
+    """Whether the interval of each number contains its identity; False for an effect of the car file or at a place."""
+    if effect.car_file_values or effect.id not in EFFECTS or EFFECTS[effect.id].disc_parameters:
+        return False
+    numbers = [(p.identity, effect.parameters[p.name]) for p in EFFECTS[effect.id].parameters if not p.choices]
+    return all(identity is not None and e.low90 <= identity <= e.high90 for identity, e in numbers)
 
 
 def held_out_change(effect: EffectFinding) -> str:

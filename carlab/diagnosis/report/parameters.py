@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.numbers import listed, with_unit
-from carlab.diagnosis.report.residual import error_fall
+from carlab.diagnosis.report.residual import error_fall, is_above_noise
 from carlab.diagnosis.settings import REPORT
 from sim_backends.effects import EFFECTS
 
@@ -45,8 +45,13 @@ def stated_number(effect: EffectFinding, car_file_parameters: Mapping[str, float
 
 
 def fitted_parameters(diagnosis: Diagnosis) -> str:
-    """Sentences about the wrong parameters of the car file and the held-out error with fitted ones."""
+    """Sentences about the wrong parameters of the car file and the held-out error with fitted ones.
+
+    If physics stays unexplained far above the noise, the fitted values are no measurements of the parameters.
+    """
     which = f": {found}" if (found := wrong_parameters(diagnosis)) else ""
+    if found and diagnosis.verdict == "unexplained" and is_above_noise(diagnosis, "refit"):
+        which += " (these values may compensate for missing physics)"
     tail = f" With fitted parameters, {fall}." if (fall := error_fall(diagnosis, "nominal", "refit")) else ""
     return f"Parameters of the car file are wrong{which}.{tail}"
 
