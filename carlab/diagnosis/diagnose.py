@@ -132,7 +132,7 @@ def diagnose(
         recordings, request = _prepare_recordings(fit, held_out, request, progress)
         recordings, noise, measured = _measure(recordings, request)
         accepted, scored, naming = _search_effects(recordings, noise, measured, request, control, timer)
-        withdrawn = withdrawn_effects(decisions, accepted, scored.found.effects)
+        withdrawn = withdrawn_effects(decisions, accepted, scored.found.possible_effects)
         outcome = _assemble_result(scored, naming, withdrawn, recordings, request, control)
     return _with_run(outcome, timer, effects or (), None if held_out else share, decisions)
 

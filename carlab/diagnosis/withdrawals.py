@@ -33,7 +33,7 @@ def withdrawn_effects(
     Args:
         decisions: all decisions of the diagnosis, in their order.
         accepted: effects that the search accepted.
-        remaining: effects after all tests.
+        remaining: effects after all tests, and those that are indistinguishable from them: these may be the cause.
     """
     failed = {d.effect: d for d in decisions if d.stage in TESTS_OF_ACCEPTED and not d.passed}
     withdrawn = (name for name in accepted if name not in remaining)

@@ -6,14 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
+
 from carlab.benchmark.cases.case import make_case
 from carlab.diagnosis.decisions import Condition, Decision, passes
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.findings import Withdrawal
+from carlab.diagnosis.identification.error_scale import Scale
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.report.write import write_report
+from carlab.diagnosis.selection.problem import SearchResult
 from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.weak_effects import held_out_conditions
 from carlab.diagnosis.withdrawals import REASONS, withdrawn_effects
+from sim_backends import SimulatorConfig
 from tests.helpers.case_files import car_in, episodes_in, write_case
 
 SMALL = Condition("selection.min_practical_size", 0.1, 0.2)
@@ -39,6 +45,18 @@ def test_reason_is_that_of_the_last_failed_test() -> None:
         "the error on held-out recordings does not fall",
         "it changes the predictions by a small part of the remaining error",
     ]
+
+
+def test_effect_of_a_set_is_not_withdrawn() -> None:
+    """A set states that the effect may be the cause; a reason why it is not would contradict this."""
+    fit = Fit(SimulatorConfig(), (), np.zeros(0), 0.0, np.zeros(3))
+    sets = {"all_wheel_drive": ("load_transfer",)}
+    scale = Scale(np.array([1]), np.ones((1, 6)))
+    found = SearchResult(fit, fit, ("all_wheel_drive",), {}, sets, (), (), scale)
+    decisions = [stand(name, WORSE, passed=False) for name in ("load_transfer", "motor_lag")]
+    accepted = ("load_transfer", "motor_lag", "all_wheel_drive")
+    withdrawn = withdrawn_effects(decisions, accepted, found.possible_effects)
+    assert [each.id for each in withdrawn] == ["motor_lag"]
 
 
 class OneBlock:

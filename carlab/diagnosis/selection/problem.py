@@ -193,6 +193,11 @@ class SearchResult:
         """The accepted effects, their fit and its scale."""
         return Model(self.effects, self.best, self.scale)
 
+    @property
+    def possible_effects(self) -> tuple[str, ...]:
+        """The accepted effects and those that are indistinguishable from them."""
+        return (*self.effects, *(other for name in self.effects for other in self.indistinguishable.get(name, ())))
+
     def without_effects(self) -> SearchResult:
         """The result with no accepted effect."""
         return replace(self, best=self.base, effects=(), chi2={}, indistinguishable={}, history=())
