@@ -47,16 +47,21 @@ def _harmonic(axis: str, length_m: float, phase: str) -> Term:
 
 
 def _stepped(name: str, symbol: str, period: float) -> Term:
+    steps = f"repeats with the {name} in steps of about {period:.2g} of its range, as if the {name} were quantised"
+    curve = f"a curve over the {name} with a period of about {period:.2g} of its range, not steps"
     return Term(
         f"sin(2 pi {symbol} / {period:.3g})",
-        f"repeats with the {name} in steps of about {period:.2g} of its range, as if the {name} were quantised",
+        steps if period <= MAX_STEP_SHARE else curve,
         (name, "steps"),
         lambda f: np.asarray(np.sin(2.0 * np.pi * f[symbol] / period)),
     )
 
 
+MAX_STEP_SHARE = 0.25
+"""Longest period [share of the range] that is called steps; four steps from zero to full command. A longer period
+follows any nonlinear response."""
 STEP_SHARES = tuple(float(p) for p in np.geomspace(0.05, 0.8, 22))
-"""Steps of quantised commands, as shares of their range."""
+"""Periods over a command, as shares of its range."""
 WAVELENGTHS_M = (0.4, 0.5, 0.64, 0.8, 1.0, 1.3, 1.7, 2.2)
 """Wavelengths [m] of terms that repeat with the place."""
 TERMS: tuple[Term, ...] = (
