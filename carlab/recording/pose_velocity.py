@@ -18,11 +18,10 @@ IndexArray = NDArray[np.intp]
 HALF_WINDOW_S = 0.05
 """Half the span of the fit [s]: eleven samples at 100 Hz, the minimum of five at 30 Hz."""
 MIN_HALF_ROWS = 2
-STATE_HALF_WINDOW_S = 0.0334
-"""The same for velocities of states: seven rows at 100 Hz, five at 40 to 60 Hz. A longer window has less noise, but
-filters the motion of a car more than the measurement model predicts (``sim_backends.measurement``)."""
-MAX_FIVE_ROW_PERIOD_S = 0.0251
-"""Above this period the fit for states has three rows, for the same reason."""
+STATE_HALF_WINDOW_S = 0.035
+"""Maximum half span for velocities of states: seven rows at 100 Hz, five at 60 Hz, three at 20 to 57 Hz. A longer
+window has less noise, but filters the motion of a car more than the measurement model predicts
+(``sim_backends.measurement``)."""
 _BLOCK_SAMPLES = 500_000
 """Samples of windows that are in memory at once."""
 _MIN_PARABOLA_SQUARE = 1e-28
@@ -95,9 +94,9 @@ def pose_motion(
     """
     dt = np.diff(t_s)
     period = float(np.median(dt[dt > 0])) if np.any(dt > 0) else 1.0
-    half = max(MIN_HALF_ROWS, round((STATE_HALF_WINDOW_S if for_states else HALF_WINDOW_S) / period))
-    if for_states and period > MAX_FIVE_ROW_PERIOD_S:
-        half = 1
+    half = max(MIN_HALF_ROWS, round(HALF_WINDOW_S / period))
+    if for_states:
+        half = max(1, int(STATE_HALF_WINDOW_S / period))
     yaw = yaw_rad.copy()
     rates = np.zeros((3, len(t_s)))
     for number in np.unique(segment):

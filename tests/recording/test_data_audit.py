@@ -143,7 +143,9 @@ def test_fault_is_found_and_repaired_by_its_option(clean, fault, finding, option
     assert warnings_of(repaired.report) == {}
     truth = foreign.drive(UNEVEN)
     np.testing.assert_allclose(repaired.episode.states[:, 3], truth["vx"], atol=0.1)
-    np.testing.assert_allclose(repaired.episode.states[:, 5], truth["yaw_rate"], atol=0.2)
+    of_three_poses = 5.0 * np.sqrt(2.0) * 2e-3 / (2.0 / 40.0)  # five standard deviations, but for first and last row
+    tolerance, inner = (of_three_poses, slice(1, -1)) if "velocities" in options else (0.2, slice(None))
+    np.testing.assert_allclose(repaired.episode.states[inner, 5], truth["yaw_rate"][inner], atol=tolerance)
 
 
 @pytest.mark.parametrize(
