@@ -142,6 +142,19 @@ def test_commands_between_rows_are_reported_as_lost(clean):
     assert "the recording lacks the commands between the rows" in action
 
 
+@pytest.mark.parametrize(("every", "source", "is_slow"), [(1, "pose", False), (2, "pose", True), (2, "column", False)])
+def test_velocities_of_poses_that_are_far_apart_are_reported(clean, every, source, is_slow):
+    """Velocities of three poses at 15 Hz average over 0.13 s."""
+    states = clean.states[::every]
+    sent = clean.sent[::every][: len(states) - 1]
+    changed = {"states": states, "requested": sent, "sent": sent, "metadata": {"velocity_source": source}}
+    slow = replace(clean, times_s=clean.times_s[::every], rewards=np.full(len(sent), np.nan), **changed)
+    _, _, faults = check([slow], [], NOMINAL)
+    actions = [f.action for f in faults if f.id == "slow_poses"]
+    assert len(actions) == is_slow
+    assert all(re.search(r"poses that are 0\.06[67] s apart", action) for action in actions)
+
+
 def test_commands_that_the_log_limits_are_reported(clean):
     _, _, faults = check([with_sent(clean, lambda sent: np.clip(sent, -0.4, 0.4, out=sent))], [], NOMINAL)
     found = {f.channel: f.action for f in faults}

@@ -103,3 +103,17 @@ def test_commands_that_predict_the_recordings_are_not_limited() -> None:
 def test_wrong_frame_rate_is_stated_with_the_verdict() -> None:
     fault = DataFault("wrong_frame_rate", "t, vx, vy, yaw_rate", 900, "repaired: the velocities were multiplied.")
     assert "The stamps probably have a wrong frame rate" in changed(mismatch(), data_faults=(fault,)).sentence
+
+
+def test_error_of_slow_poses_is_no_missing_physics() -> None:
+    """At 20 Hz the simulator of the car itself has an error above the noise."""
+    fault = DataFault("slow_poses", "vx, vy, yaw_rate", 900, "reported: the poses are 0.05 s apart.")
+    held = dict(mismatch().held_out)
+    held["with_effects"] = replace(held["with_effects"], score=1.9)
+    above = changed(mismatch(), held_out=held).sentence
+    assert "the simulator lacks physics that the diagnosis does not find" in above
+    slow = changed(mismatch(), held_out=held, data_faults=(fault,)).sentence
+    assert "the simulator lacks physics" not in slow
+    assert "The poses are so far apart that the estimated velocities have errors above the noise" in slow
+    held["with_effects"] = replace(held["with_effects"], score=1.1)
+    assert "so far apart" not in changed(mismatch(), held_out=held, data_faults=(fault,)).sentence

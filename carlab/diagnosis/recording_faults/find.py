@@ -11,7 +11,7 @@ from carlab.diagnosis.recording_faults.commands import check_commands, check_yaw
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair, merged
 from carlab.diagnosis.recording_faults.integration_step import check_integration
 from carlab.diagnosis.recording_faults.pose import check_pose
-from carlab.diagnosis.recording_faults.velocity import check_velocities
+from carlab.diagnosis.recording_faults.velocity import check_pose_rate, check_velocities
 from carlab.diagnosis.state_alignment import lost_frames
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.measurement import COMMAND_DELAY
@@ -46,6 +46,8 @@ def check(
         check_pose(repair, nominal.control_period_s)
     check_yaw_direction([repair for repair in usable if repair.usable])
     check_velocities(usable, alike=alike)
+    for repair in usable:
+        check_pose_rate(repair)
     check_commands([repair for repair in usable if repair.usable], nominal)
     repaired = [repair.result() for repair in repairs]
     faults = merged([fault for repair in repairs for fault in repair.faults])

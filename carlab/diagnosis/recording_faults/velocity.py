@@ -29,7 +29,7 @@ from carlab.recording.faults.velocity import (
     wrong_frame_rate,
     wrong_velocity_frame,
 )
-from carlab.recording.pose_velocity import PoseMotion
+from carlab.recording.pose_velocity import STATE_HALF_WINDOW_S, PoseMotion
 
 
 def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
@@ -63,6 +63,18 @@ def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
             _rebuild_clock(repairs[k], *clocks[k])
         repairs[k].set_velocities(repairs[k].motion())
         repairs[k].repaired(fault, "the velocities were estimated from the pose without delay")
+
+
+def check_pose_rate(repair: EpisodeRepair) -> None:
+    """Report velocities from poses that are too far apart for an accurate estimate."""
+    if repair.has_velocity_columns or repair.period_s <= STATE_HALF_WINDOW_S:
+        return
+    action = (
+        f"reported: the velocities are estimated from poses that are {repair.period_s:.3g} s apart, so they have "
+        "errors above the noise when the motion changes quickly. Do not interpret an error of this size as missing "
+        "physics. Record poses at 30 Hz or faster."
+    )
+    repair.report("slow_poses", "vx, vy, yaw_rate", len(repair.times_s), action)
 
 
 def _backward_differences(repair: EpisodeRepair, motion: PoseMotion) -> Fault | None:

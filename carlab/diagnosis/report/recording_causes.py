@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from carlab.diagnosis.findings import Diagnosis, EffectFinding
+from carlab.diagnosis.findings import Diagnosis, EffectFinding, final_model_name
 from carlab.diagnosis.report.numbers import listed, with_unit
 from carlab.diagnosis.report.residual import is_above_noise
 from carlab.diagnosis.settings import IDENTIFICATION, REPORT
@@ -10,16 +10,19 @@ from sim_backends.effects import EFFECTS
 from sim_backends.measurement import COMMAND_DELAY, LATENCY
 from sim_backends.registry import REGISTRY
 
-LIMITED, FRAME_RATE = "limited_commands", "wrong_frame_rate"
+LIMITED, FRAME_RATE, SLOW_POSES = "limited_commands", "wrong_frame_rate", "slow_poses"
 """Ids of faults."""
 
 
 def recording_causes(diagnosis: Diagnosis) -> str:
-    """Sentences, each after a space, about limited commands, stamps, late and filtered poses; empty without these."""
-    return (
-        f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{_late_poses(diagnosis)}"
-        f"{_filtered_poses(diagnosis)}"
-    )
+    """Sentences, each after a space, about limited commands, stamps and poses; empty without these causes."""
+    of_poses = f"{_slow_poses(diagnosis)}{_late_poses(diagnosis)}{_filtered_poses(diagnosis)}"
+    return f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{of_poses}"
+
+
+def has_slow_poses(diagnosis: Diagnosis) -> bool:
+    """Whether velocities are estimated from poses that are too far apart."""
+    return any(fault.id == SLOW_POSES for fault in diagnosis.data_faults)
 
 
 def limited_channels(diagnosis: Diagnosis) -> list[str]:
@@ -51,6 +54,16 @@ def _wrong_frame_rate(diagnosis: Diagnosis) -> str:
     return (
         " The stamps probably have a wrong frame rate, which changes all forces and delays: compare the length of the "
         "recording with a clock before anything else."
+    )
+
+
+def _slow_poses(diagnosis: Diagnosis) -> str:
+    """That the remaining error may be that of velocities from poses that are far apart."""
+    if not has_slow_poses(diagnosis) or not is_above_noise(diagnosis, final_model_name(diagnosis.held_out)):
+        return ""
+    return (
+        " The poses are so far apart that the estimated velocities have errors above the noise: the remaining error "
+        "may be theirs, and no missing physics. Record poses at 30 Hz or faster."
     )
 
 

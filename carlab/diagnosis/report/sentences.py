@@ -13,7 +13,7 @@ from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report.drift import drift_sentence, has_changed
 from carlab.diagnosis.report.numbers import listed, number, unit_text, with_unit
 from carlab.diagnosis.report.parameters import excluded_sizes, fitted_parameters, late_commands, parameters_at_limit
-from carlab.diagnosis.report.recording_causes import limited_channels, recording_causes
+from carlab.diagnosis.report.recording_causes import has_slow_poses, limited_channels, recording_causes
 from carlab.diagnosis.report.residual import (
     agrees_when_fitted,
     differs_when_held_out,
@@ -317,7 +317,7 @@ def _parameters(diagnosis: Diagnosis) -> str:
 
 def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
     """A warning if the score stays well above the noise floor; else empty."""
-    if not is_above_noise(diagnosis, which):
+    if not is_above_noise(diagnosis, which) or has_slow_poses(diagnosis):
         return ""
     if which != "nominal" and agrees_when_fitted(diagnosis):
         return (
