@@ -149,7 +149,7 @@ class LowFrictionPatch(DynamicsEffect):
     id = "low_friction_patch"
     name = "a low-friction patch"
     summary = "There is a place on the floor where grip is low."
-    sentence = "grip falls by {loss:percent} within {radius} of the place x = {x}, y = {y}"
+    sentence = "grip falls by {loss:percent} within {radius} of the place x = {x:place}, y = {y:place}"
     refuted_if = "the car also slides elsewhere at the same speed and turn, or does not slide there on another lap"
     order = 20
     depends_on = frozenset({"place"})

@@ -92,6 +92,12 @@ def test_interval_across_zero_states_that_the_sign_is_not_certain() -> None:
     assert "0.2 N (−0.3 to 0.7 at 90 %; its sign is not certain) pushes the car to the right." in sentence
 
 
+def test_coordinates_of_a_place_have_no_uncertain_sign() -> None:
+    place = {"x": around(3.0, "m"), "y": Estimate(0.0018, 0.006, -0.0081, 0.0117, "m")}
+    sentence = effect_sentence("low_friction_patch", finding("low_friction_patch").parameters | place)
+    assert sentence.endswith("y = 0.0018 m (−0.0081 to 0.0117).")
+
+
 def test_effect_outside_the_catalogue_is_named_by_its_id() -> None:
     assert "wind gust" in effect_sentence("wind_gust", {"force": around(1.0, "N")})
     assert refutation_sentence("wind_gust").startswith("This would be wrong if")

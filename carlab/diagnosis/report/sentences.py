@@ -54,7 +54,7 @@ class _Filled:
 
     ``{p}`` is the number with unit and interval, ``{p:size}`` its magnitude (with ``{p:left|right}`` for the sign),
     ``{p:percent}`` and ``{p:size percent}`` the same in per cent, ``{p:each minute}`` a rate [1/s] in per cent per
-    minute, ``{p:choice a|b}`` a word for a choice.
+    minute, ``{p:choice a|b}`` a word for a choice, ``{p:place}`` a coordinate, whose sign means nothing.
     """
 
     def __init__(self, estimate: Estimate | None) -> None:
@@ -79,19 +79,19 @@ class _Filled:
             factor, unit = 100.0, "%"
         if "each minute" in spec:
             factor, unit = 6000.0, "% of its first value each minute"
-        return f"{_scaled(value, factor, unit)}{_interval(low, high, factor, e.at_limit)}"
+        return f"{_scaled(value, factor, unit)}{_interval(low, high, factor, e.at_limit, spec != 'place')}"
 
 
 def _scaled(value: float, factor: float, unit: str) -> str:
     return f"{number(value * factor)} {unit}".strip() if math.isfinite(value) else number(value)
 
 
-def _interval(low: float, high: float, factor: float, at_limit: bool) -> str:
+def _interval(low: float, high: float, factor: float, at_limit: bool, has_sign: bool = True) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return " (interval unknown)" if math.isnan(low) or math.isnan(high) else " (open interval at 90 %)"
     if at_limit and low == high:  # beyond a bound a fit has no information about the number
         return " (at the limit of its range; interval unknown)"
-    notes = "; its sign is not certain" if low < 0.0 < high else ""
+    notes = "; its sign is not certain" if has_sign and low < 0.0 < high else ""
     notes += "; at the limit of its range" if at_limit else ""
     return f" ({number(low * factor)} to {number(high * factor)}{AT_90}{notes})"
 
