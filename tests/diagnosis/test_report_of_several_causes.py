@@ -79,8 +79,7 @@ def test_effects_that_raise_the_score_explain_no_negative_share() -> None:
     rest = Unexplained(1.21, ("yaw",), "everywhere alike", "odd in steering", "dr/dt += -1 d")
     worse = replace(diagnosis("mismatch", finding("steering_lag"), refit=4.0, with_effects=4.4), unexplained=rest)
     sentence = verdict_sentence(worse)
-    assert (
-        "(all channels: from 4 to 4.4 noise floors), so the effects do not lower the error of all channels." in sentence
-    )
+    assert "(all channels: from 4 to 4.4 noise floors), so the effects do not lower the error over" in sentence
+    assert "over all channels, and their names are uncertain." in sentence
     assert sentence.endswith("The refit's squared excess over the noise floor stays unexplained.")
     assert "%" not in sentence

@@ -37,7 +37,7 @@ def explanation(diagnosis: Diagnosis) -> str:
     if not math.isfinite(share):
         return ""
     if share < 0.0:
-        return ", so the effects do not lower the error of all channels"
+        return ", so the effects do not lower the error over all channels, and their names are uncertain"
     return f", which explains {percent(share)} of the refit's squared excess over the noise floor"
 
 
