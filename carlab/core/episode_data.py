@@ -59,6 +59,11 @@ class EpisodeData:
         return f"<EpisodeData: {self.ticks} commands in {self.times_s[-1] - self.times_s[0]:.1f} s>"
 
     @property
+    def has_velocity_columns(self) -> bool:
+        """Whether velocities were recorded, rather than differentiated from the poses of the rows."""
+        return "column" in self.metadata.get("velocity_source", "column")
+
+    @property
     def ticks(self) -> int:
         """Number of commands T."""
         return int(self.sent.shape[0])

@@ -31,7 +31,7 @@ from carlab.diagnosis.identification.measurement_noise import Noise, estimate_no
 from carlab.diagnosis.identification.velocity_filter import VelocityFilter
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.limits import effect_limits
-from carlab.diagnosis.measured_filter import FILTER, measured_filter, name_filter, with_filter
+from carlab.diagnosis.measured_filter import FILTER, have_velocity_columns, measured_filter, name_filter, with_filter
 from carlab.diagnosis.naming import (
     NamingResult,
     accept_names,
@@ -218,7 +218,9 @@ def _search_effects(
     control = replace(control, progress=timer.progress(control.progress))
     windows, nominal = recordings.fit_windows, with_filter(request.nominal, measured)
     floor = mean_noise_floor(windows, noise, nominal)
-    candidates = tuple(name for name in _candidates(request) if measured is None or name != FILTER)
+    candidates = _candidates(request)
+    if measured is not None or (request.effects is None and not have_velocity_columns(recordings.fit_segments)):
+        candidates = tuple(name for name in candidates if name != FILTER)
     problem = SearchProblem(nominal, windows, floor, noise.measured, confusable_effects(), candidates, request.settings)
     search_control = control.part(*SEARCH_PROGRESS)
     found = search(problem, search_control)

@@ -25,13 +25,18 @@ TIME_CONSTANT = f"effects.{FILTER}.{VelocityFilterLag.lag_parameter}"
 
 
 def measured_filter(segments: Sequence[RecordingSegment], nominal: SimulatorConfig) -> VelocityFilter | None:
-    """The filter of the velocities; None without one, or if the car file states it."""
-    measured = velocity_filter(segments)
+    """The filter of the velocities; None without one or without recorded velocities, or if the car file states it."""
+    measured = velocity_filter(segments) if have_velocity_columns(segments) else None
     if measured is None:
         return None
     stated_s = nominal.effects.get(FILTER, {}).get(VelocityFilterLag.lag_parameter, 0.0)
     difference_s = abs(measured.time_constant_s - stated_s)
     return None if difference_s < IDENTIFICATION.filter_change_min_s else measured
+
+
+def have_velocity_columns(segments: Sequence[RecordingSegment]) -> bool:
+    """Whether all velocities were recorded; those that are differentiated poses went through no filter."""
+    return all(segment.has_velocity_columns for segment in segments)
 
 
 def with_filter(nominal: SimulatorConfig, measured: VelocityFilter | None) -> SimulatorConfig:

@@ -63,6 +63,7 @@ class RecordingSegment:
         in_event: (n,) whether a row, or a pose that its initial state is estimated from, is in an event.
         command_deviations: (n, R, 2) commands in R equal parts of each cell less their mean over the cell; None if they
             are constant in each cell.
+        has_velocity_columns: whether the velocities of ``states`` were recorded, rather than differentiated poses.
     """
 
     recording: int
@@ -77,6 +78,7 @@ class RecordingSegment:
     sampled_s: float
     in_event: NDArray[np.bool_]
     command_deviations: FloatArray | None = None
+    has_velocity_columns: bool = True
 
     @property
     def duration_s(self) -> float:
@@ -271,6 +273,7 @@ def _segment(
         sampled_s=period_s,
         in_event=in_event,
         command_deviations=deviations,
+        has_velocity_columns=episode.has_velocity_columns,
     )
 
 

@@ -31,6 +31,8 @@ def test_velocities_of_wheel_odometry_are_replaced_by_those_of_the_pose():
         "repaired: vy does not follow the motion of the pose; the velocities were estimated from the pose.",
     )
     np.testing.assert_allclose(fit.states[:, VY], true.states[:, VY], atol=0.12)
+    assert odometry.has_velocity_columns
+    assert not fit.has_velocity_columns
 
 
 def test_velocities_of_zero_are_one_fault_for_each_column(clean):

@@ -178,3 +178,11 @@ def test_no_filter_is_measured_against_slow_poses():
     changed = {"times_s": slow.times_s[rows], "states": slow.states[rows], "poses": slow.poses[rows]}
     slow = replace(slow, requested=commands, sent=commands, rewards=np.zeros(len(commands)), **changed)
     assert velocity_filter(segments_of([slow])) is None
+
+
+def test_velocities_of_poses_have_no_measured_filter() -> None:
+    """At 20 Hz the derivative of noisy poses resembled a filter, which was named with a time constant of 0 s."""
+    filtered = episode(filtered_velocities(0.06))
+    assert measured_filter(segments_of([filtered]), SimulatorConfig()) is not None
+    of_poses = replace(filtered, metadata={"velocity_source": "vx, vy: local quadratic; yaw_rate: local quadratic"})
+    assert measured_filter(segments_of([of_poses]), SimulatorConfig()) is None

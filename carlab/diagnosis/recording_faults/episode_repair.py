@@ -54,12 +54,12 @@ class EpisodeRepair:
     def of(cls, episode: EpisodeData) -> EpisodeRepair:
         """Copy a recording's arrays."""
         commands = np.vstack([episode.sent, episode.sent[-1:]])
-        source = episode.metadata.get("velocity_source", "column")
         states = episode.states.copy()
         segment = segments(len(states), gap_rows(episode.times_s)) if episode.ticks > 1 else np.zeros(len(states))
         rows = np.arange(len(states))
         interpolated = np.zeros(len(states), dtype=bool)
-        return cls(episode, episode.times_s.copy(), states, commands, segment, rows, interpolated, "column" in source)
+        has_columns = episode.has_velocity_columns
+        return cls(episode, episode.times_s.copy(), states, commands, segment, rows, interpolated, has_columns)
 
     @property
     def period_s(self) -> float:
@@ -139,8 +139,10 @@ class EpisodeRepair:
         """The repaired recording; the same object if nothing was changed."""
         if not self.is_changed:
             return self.episode
+        metadata = self.episode.metadata
         if not self.has_velocity_columns:
-            self.set_velocities(self.motion(for_states=True))
+            self.set_velocities(motion := self.motion(for_states=True))
+            metadata = {**metadata, "velocity_source": motion.method()}
         extra = {name: column[self.rows] for name, column in self.episode.extra.items() if name != "segment"}
         is_incomplete = _missing_numbers(self.episode).any(axis=1)
         segment = self.segment + np.cumsum(is_incomplete)[self.rows]
@@ -159,6 +161,7 @@ class EpisodeRepair:
             rewards=self.episode.rewards[ticks],
             poses=poses,
             extra=extra,
+            metadata=metadata,
         )
 
 
