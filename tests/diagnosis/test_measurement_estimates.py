@@ -203,6 +203,18 @@ def test_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, fixed_freque
         assert found.periods_per_m == pytest.approx(4.0, abs=0.05)
 
 
+def test_line_in_differentiated_poses_is_no_vibration(plain: Drive) -> None:
+    """Differences over five poses at 60 Hz amplify noise at 7.6 Hz, which resembles a wheel at steady speed."""
+    segments = []
+    for segment in plain.segments:
+        residual = segment.residual.copy()
+        cycles = 4.0 * np.cumsum(segment.speed) * segment.sampled_s
+        residual[:, 5] += 3.0 * np.std(residual[:, 5]) * np.sin(2.0 * np.pi * cycles)
+        segments.append(replace(segment, residual=residual))
+    assert find_vibration(segments) is not None
+    assert find_vibration([replace(segment, has_velocity_columns=False) for segment in segments]) is None
+
+
 @pytest.mark.parametrize(
     "effects", [("aerodynamic_drag", "velocity_filter_lag", "yaw_damping"), pytest.param(None, marks=pytest.mark.slow)]
 )

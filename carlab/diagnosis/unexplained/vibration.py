@@ -55,7 +55,10 @@ class Vibration:
 
 
 def find_vibration(segments: Sequence[RecordingSegment]) -> Vibration | None:
-    """The strongest significant line in yaw, vx, vy or yaw rate, or None."""
+    """The strongest significant line in yaw, vx, vy or yaw rate, or None.
+
+    Velocities that are differentiated poses are not searched: the differentiation makes a band of their white noise.
+    """
     power, strength, by_time = (np.zeros((6, n)) for n in (len(PERIODS_PER_M), len(PERIODS_PER_M), len(FREQUENCIES_HZ)))
     blocks = 0
     for segment in segments:
@@ -82,7 +85,8 @@ def find_vibration(segments: Sequence[RecordingSegment]) -> Vibration | None:
             blocks += 1
     if blocks == 0:
         return None
-    channel = 2 + int(np.argmax(power[2:].max(axis=1)))
+    channels = slice(2, 6 if all(segment.has_velocity_columns for segment in segments) else 3)
+    channel = 2 + int(np.argmax(power[channels].max(axis=1)))
     line = int(np.argmax(power[channel]))
     highest = float(power[channel, line])
     if highest < UNEXPLAINED.vibration_ratio_min * blocks or highest < by_time[channel].max():
