@@ -117,3 +117,15 @@ def test_error_of_slow_poses_is_no_missing_physics() -> None:
     assert "The poses are so far apart that the estimated velocities have errors above the noise" in slow
     held["with_effects"] = replace(held["with_effects"], score=1.1)
     assert "so far apart" not in changed(mismatch(), held_out=held, data_faults=(fault,)).sentence
+
+
+def test_model_that_predicts_worse_than_the_car_file_is_stated() -> None:
+    """A fit to 17 s of driving extrapolates."""
+    held = dict(mismatch().held_out)
+    held["with_effects"] = replace(held["with_effects"], score=51.0)
+    worse = changed(mismatch(), held_out=held).sentence
+    assert "against 51 noise floors): the fitted recordings are too short or too uniform to determine" in worse
+    assert "than model.toml" not in mismatch().sentence
+    held["nominal"] = replace(held["nominal"], score=0.9)
+    held["with_effects"] = replace(held["with_effects"], score=1.1)
+    assert "than model.toml" not in changed(mismatch(), held_out=held).sentence

@@ -184,6 +184,9 @@ def test_car_that_changed_before_the_held_out_recordings_is_not_missing_physics(
     assert curves_advice(changed) == ""
     shown = page(changed)
     assert "odd in speed" not in shown
+    similar = verdict_sentence(replace(diagnosis("unexplained", 1.23), fitted_score=1.14))
+    assert "its error on the held-out ones is little above the noise (1.23 noise floors," in similar
+    assert "changed" not in similar
     lacking = replace(changed, fitted_score=9.0)
     assert verdict_sentence(lacking).startswith("The simulator lacks physics")
     assert verdict_title(lacking) == "Physics outside the catalogue is missing"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, final_model_name
-from carlab.diagnosis.report.numbers import listed, with_unit
+from carlab.diagnosis.report.numbers import listed, number, with_unit
 from carlab.diagnosis.report.residual import is_above_noise
 from carlab.diagnosis.settings import IDENTIFICATION, REPORT
 from sim_backends.effects import EFFECTS
@@ -15,9 +15,9 @@ LIMITED, FRAME_RATE, SLOW_POSES = "limited_commands", "wrong_frame_rate", "slow_
 
 
 def recording_causes(diagnosis: Diagnosis) -> str:
-    """Sentences, each after a space, about limited commands, stamps and poses; empty without these causes."""
+    """Sentences, each after a space, about limited commands, stamps, poses and length; empty without these causes."""
     of_poses = f"{_slow_poses(diagnosis)}{_late_poses(diagnosis)}{_filtered_poses(diagnosis)}"
-    return f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{of_poses}"
+    return f"{_limited_commands(diagnosis)}{_wrong_frame_rate(diagnosis)}{of_poses}{_short_recordings(diagnosis)}"
 
 
 def has_slow_poses(diagnosis: Diagnosis) -> bool:
@@ -64,6 +64,21 @@ def _slow_poses(diagnosis: Diagnosis) -> str:
     return (
         " The poses are so far apart that the estimated velocities have errors above the noise: the remaining error "
         "may be theirs, and no missing physics. Record poses at 30 Hz or faster."
+    )
+
+
+def _short_recordings(diagnosis: Diagnosis) -> str:
+    """That the fitted recordings do not determine the parameters, if the car file predicts better than the model."""
+    held, name = diagnosis.held_out, final_model_name(diagnosis.held_out)
+    if not ({"nominal", name} <= held.keys() and is_above_noise(diagnosis, name)):
+        return ""
+    nominal, model = held["nominal"].score, held[name].score
+    if model <= nominal:
+        return ""
+    return (
+        f" The car file has a smaller error on held-out recordings than model.toml ({number(nominal)} against "
+        f"{number(model)} noise floors): the fitted recordings are too short or too uniform to determine the "
+        "parameters."
     )
 
 

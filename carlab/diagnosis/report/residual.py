@@ -74,6 +74,23 @@ def differs_when_held_out(diagnosis: Diagnosis) -> bool:
     return diagnosis.verdict == "unexplained" and agrees_when_fitted(diagnosis)
 
 
+def difference_when_held_out(diagnosis: Diagnosis) -> str:
+    """Sentences about a refit that explains the fitted recordings, but not the held-out ones."""
+    held, fitted = diagnosis.held_out["refit"], number(diagnosis.fitted_score)
+    error = f"{number(held.score)} noise floors, {with_unit(held.position_m, 'm')} after "
+    error += with_unit(diagnosis.horizon_s, "s")
+    if not is_above_noise(diagnosis, "refit"):
+        return (
+            f"The refitted simulator agrees with the fitted recordings ({fitted} noise floors), and its error on the "
+            f"held-out ones is little above the noise ({error}). Longer recordings show whether physics is missing."
+        )
+    return (
+        f"The refitted simulator agrees with the fitted recordings ({fitted} noise floors) but not with the held-out "
+        f"ones ({error}). The car or the motion capture changed between them (carlab compare names the change), or the "
+        "held-out recordings have conditions that the fitted ones lack."
+    )
+
+
 def relevant_residual(diagnosis: Diagnosis) -> Unexplained | None:
     """The unexplained residual if the report describes it.
 

@@ -16,6 +16,7 @@ from carlab.diagnosis.report.parameters import excluded_sizes, fitted_parameters
 from carlab.diagnosis.report.recording_causes import has_slow_poses, limited_channels, recording_causes
 from carlab.diagnosis.report.residual import (
     agrees_when_fitted,
+    difference_when_held_out,
     differs_when_held_out,
     error_fall,
     explained_share,
@@ -357,7 +358,7 @@ def _data(diagnosis: Diagnosis) -> str:
 
 def _unexplained(diagnosis: Diagnosis) -> str:
     if differs_when_held_out(diagnosis):
-        return _different_when_held_out(diagnosis)
+        return difference_when_held_out(diagnosis)
     rest = diagnosis.unexplained
     which = "none of the searched effects" if diagnosis.search.effects else "no effect of the catalogue"
     text = f"The simulator lacks physics that {which} explains"
@@ -373,16 +374,6 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     if not diagnosis.search.is_complete or limited_channels(diagnosis):
         return sentence
     return f"{sentence} Class of the missing physics: {rest.kind or 'unknown'}."
-
-
-def _different_when_held_out(diagnosis: Diagnosis) -> str:
-    held = diagnosis.held_out["refit"]
-    return (
-        f"The refitted simulator agrees with the fitted recordings ({number(diagnosis.fitted_score)} noise floors) but "
-        f"not with the held-out ones ({number(held.score)} noise floors, {with_unit(held.position_m, 'm')} after "
-        f"{with_unit(diagnosis.horizon_s, 's')}). The car or the motion capture changed between them (carlab compare "
-        "names the change), or the held-out recordings have conditions that the fitted ones lack."
-    )
 
 
 def _inconclusive(diagnosis: Diagnosis) -> str:
