@@ -59,7 +59,10 @@ class ResidualModel:
     def class_statement(self) -> str:
         """Class of the missing physics."""
         if not self.chosen:
-            return "no term of the library explains it: like noise, vibration (oscillating), or a hidden state"
+            return (
+                "no term of the library explains it: like noise, vibration (oscillating), a hidden state or a force of "
+                "another form"
+            )
         parts: list[str] = []
         for c in self.chosen:
             text = f"{c.term.statement}; acts on {_ACTS_ON[c.channel][0]}"
