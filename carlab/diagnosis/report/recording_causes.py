@@ -88,11 +88,11 @@ def _late_poses(diagnosis: Diagnosis) -> str:
     No effect explains such a delay, because the fit of a latency that the car file does not state contains it.
     """
     found, delay_s = diagnosis.parameters.get(LATENCY), diagnosis.car_file_parameters.get(COMMAND_DELAY)
-    if found is None or delay_s is None or LATENCY in diagnosis.car_file_parameters:
+    expected_s = REGISTRY[LATENCY].default
+    if found is None or delay_s is None or expected_s is None or LATENCY in diagnosis.car_file_parameters:
         return ""
     if COMMAND_DELAY in diagnosis.parameters:  # a repaired clock offset, which hides the delay
         return ""
-    expected_s = REGISTRY[LATENCY].default
     if found.value - expected_s <= REPORT.latency_z_max * IDENTIFICATION.latency_std_s:
         return ""
     return (
