@@ -77,8 +77,8 @@ def _short_recordings(diagnosis: Diagnosis) -> str:
         return ""
     return (
         f" The car file has a smaller error on held-out recordings than model.toml ({number(nominal)} against "
-        f"{number(model)} noise floors): the fitted recordings are too short or too uniform to determine the "
-        "parameters."
+        f"{number(model)} noise floors): the fitted recordings may be too short or too uniform to determine "
+        "the parameters."
     )
 
 
