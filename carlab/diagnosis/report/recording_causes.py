@@ -68,7 +68,7 @@ def _slow_poses(diagnosis: Diagnosis) -> str:
 
 
 def _short_recordings(diagnosis: Diagnosis) -> str:
-    """That the fitted recordings do not determine the parameters, if the car file predicts better than the model."""
+    """That the fitted recordings do not determine the parameters, if the car file has a smaller held-out error."""
     held, name = diagnosis.held_out, final_model_name(diagnosis.held_out)
     if not ({"nominal", name} <= held.keys() and is_above_noise(diagnosis, name)):
         return ""
