@@ -2,6 +2,7 @@
 
 import math
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,12 @@ def test_tasks_of_the_example_and_of_this_page_have_no_error() -> None:
     check_task(choose_task(f"{EXAMPLE}:StopAfterOneMetre").load())
 
 
+def slow(self: Task, features: Any, action: Any, next_features: Any) -> Any:
+    """A reward of 25 ms, where a tick has 33 ms in all."""
+    time.sleep(0.025)
+    return next_features[..., 0]
+
+
 def in_place(self: Task, features: Any, action: Any, next_features: Any) -> Any:
     next_features[..., 0] -= 1.0
     return next_features[..., 0]
@@ -99,6 +106,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"reward": lambda self, f, a, n: 1.0 + 0.0 * n[..., 0]}, "nothing to learn"),
     ({"reward": lambda self, f, a, n: (n[..., 0] - 100.0) ** 0.5}, "reward is not finite"),
     ({"reward": in_place}, "reward changes its arguments"),
+    ({"reward": slow}, "take [0-9]+ ms in a tick; make them faster than 20 ms"),
     ({"cost": lambda self, n: -1.0 + 0.0 * n[..., 0]}, "must not be below zero"),
     ({"terminated": lambda self, n: n[..., 0] * 0.0}, "terminated returns float64; return booleans"),
     ({"terminated": lambda self, n: n[..., 0] < 10.0}, "the episode would end at once"),

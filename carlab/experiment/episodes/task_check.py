@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +24,8 @@ MAX_REWARD, MAX_SPEED_MPS, MAX_POSITION_M = 100.0, 20.0, 1000.0
 TORCH_TOLERANCE = 1e-3
 """Relative difference of float32 from float64."""
 MAX_TICKS = 10**6
+MAX_TICK_S, TIMED_CALLS = 0.02, 5
+"""Largest computation time [s] of a task in a tick, the shortest of some calls; at 30 Hz a tick has 0.033 s in all."""
 OTHER_PERIOD_S = 0.1
 """A control period other than that of carlab's tasks."""
 _METRES = "positions are in metres"
@@ -58,6 +61,7 @@ def check_task(task: Task, arena_m: Corners = ()) -> None:
     costs = _check_function(task, "cost", (after,), bool_wanted=False)
     ends = _check_function(task, "terminated", (before,), bool_wanted=True)
     _check_function(task, "success", (after,), bool_wanted=True)
+    _check_speed(task, before[:1], action[:1], after[:1])
     if np.abs(rewards).max() > MAX_REWARD:
         raise _error(task, f"reward is {np.abs(rewards).max():.4g} in a tick; scale it so that a good tick is about 1")
     if np.ptp(rewards) == 0.0 and np.ptp(task.reward(before, 0.5 * action, after + 0.1)) == 0.0:
@@ -69,6 +73,24 @@ def check_task(task: Task, arena_m: Corners = ()) -> None:
     if (task.cost(before) > 0.0).any():
         raise _error(task, "cost is above zero at a start of sample_start; move the start or the keep-out shapes")
     _check_summary(task, starts)
+
+
+def _check_speed(task: Task, before: FloatArray, action: FloatArray, after: FloatArray) -> None:
+    """Raise ConfigError if the functions of a tick are too slow for a control loop; arguments have one row each."""
+    times_s = []
+    for _ in range(TIMED_CALLS):
+        began_s = time.perf_counter()
+        task.reward(before, action, after)
+        task.cost(after)
+        task.terminated(after)
+        task.success(after)
+        times_s.append(time.perf_counter() - began_s)
+    if min(times_s) > MAX_TICK_S:
+        raise _error(
+            task,
+            f"reward, cost, terminated and success take {min(times_s) * 1e3:.0f} ms in a tick; make them faster than "
+            f"{MAX_TICK_S * 1e3:.0f} ms together, so that the control loop is not late",
+        )
 
 
 def _error(task: Task, text: str) -> ConfigError:
