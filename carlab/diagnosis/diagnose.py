@@ -25,7 +25,16 @@ from carlab.diagnosis.final_models import (
     measured_curves,
     trained_models,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, FigureData, RecordingUse, Withdrawal, final_model_name
+from carlab.diagnosis.findings import (
+    DataFault,
+    Diagnosis,
+    FigureData,
+    RecordingUse,
+    Unexplained,
+    Withdrawal,
+    final_model_name,
+)
+from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut, mean_noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_filter import VelocityFilter
@@ -259,11 +268,7 @@ def _assemble_result(
     findings = effect_findings(
         scored, request.effects is None, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share)
     )
-    share = unexplained_share(scored)
-    unexplained, described = None, None
-    if share >= EVIDENCE.unexplained_share_min:
-        error = scored.errors["with_effects"]
-        unexplained, described = describe_unexplained(scored.problem, naming, share, error, held_out)
+    unexplained, described = _unexplained(scored, naming)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
     measured, curve_trial = measured_curves(scored, described, recordings, request, control)
     corrected = scored if described is None else replace(scored, fit=described, is_joint=False)
@@ -307,6 +312,14 @@ def _assemble_result(
     noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
     figure_data = replace(figure_data, noise=noise)
     return Outcome(diagnosis, figure_data, corrected.fit.config, models, held_out.windows)
+
+
+def _unexplained(scored: ScoredSearch, naming: NamingResult) -> tuple[Unexplained | None, Fit | None]:
+    """The residual if it is relevant, and the fit with the uncatalogued physics that describes it, if there is one."""
+    share = unexplained_share(scored)
+    if share < EVIDENCE.unexplained_share_min:
+        return None, None
+    return describe_unexplained(scored.problem, naming, share, scored.errors["with_effects"], scored.held_out)
 
 
 def _stated_parameters(nominal: SimulatorConfig) -> dict[str, float]:
