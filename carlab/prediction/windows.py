@@ -21,6 +21,7 @@ from carlab.core.errors import DataError
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.prediction.even_grid import MIN_DEVIATION, cell_means, even_grid, part_count, part_deviations, row_period_s
+from carlab.prediction.past import past_commands, rows_before
 
 IndexArray = NDArray[np.int64]
 
@@ -107,7 +108,8 @@ class PredictionWindows:
         period_s: length of a step.
         initial_states: (S, 6) x, y [m], yaw [rad] in the recording's frame, vx, vy [m/s] in the body frame, yaw rate
             [rad/s]; other states have the same columns.
-        past_commands: (S, H, 2) steering and throttle before the window; before the stretch its first ones.
+        past_commands: (S, H, 2) steering and throttle before the window (``carlab.prediction.past``); before the
+            stretch its first ones.
         commands: (S, K, 2) steering and throttle in the window.
         measured: (S, K + 1, 6) states as recorded, yaw unwrapped.
         past_states: (S, H, 6) smoothed states before the window; before the stretch its first one.
@@ -309,11 +311,6 @@ def history_rows(period_s: float, seconds: float = HISTORY_S) -> int:
     return max(round(seconds / period_s), 1)
 
 
-def _before(values: FloatArray, row: int, period_s: float) -> FloatArray:
-    """The rows (H, ...) before ``row``, with the first one where there are too few."""
-    return values[np.maximum(np.arange(row - history_rows(period_s), row), 0)]
-
-
 def _deviations(starts: Sequence[tuple[RecordingSegment, int]], past: int, steps: int) -> FloatArray | None:
     """Command deviations (S, H + K, R, 2) of windows that start at rows of segments; 0 before the stretch."""
     found = []
@@ -357,7 +354,7 @@ def cut_windows(
         if np.hypot(*segment.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
         and (with_events or not segment.in_event[row : row + steps + 1].any())
     ]
-    needed_s = horizon_s + MIN_HISTORY_S
+    past, needed_s = history_rows(period_s), horizon_s + MIN_HISTORY_S
     if all(len(segment.t_s) <= history_rows(period_s, MIN_HISTORY_S) + steps for segment in segments):
         raise DataError(
             f"The longest stretch without a gap has {max(segment.duration_s for segment in segments):.1f} s; a "
@@ -370,16 +367,16 @@ def cut_windows(
     return PredictionWindows(
         period_s=period_s,
         initial_states=np.stack([segment.smooth[row] for segment, row in starts]),
-        past_commands=np.stack([_before(segment.commands, row, period_s) for segment, row in starts]),
+        past_commands=np.stack([past_commands(segment.commands, row, past) for segment, row in starts]),
         commands=np.stack([segment.commands[row : row + steps] for segment, row in starts]),
         measured=np.stack([segment.states[row : row + steps + 1] for segment, row in starts]),
-        past_states=np.stack([_before(segment.smooth, row, period_s) for segment, row in starts]),
+        past_states=np.stack([rows_before(segment.smooth, row, past) for segment, row in starts]),
         curvature_bias=np.stack([segment.curvature_bias[row] for segment, row in starts]),
         t0_s=np.array([segment.t_s[row] for segment, row in starts]),
         recording=np.array([segment.recording for segment, _ in starts]),
         block=np.array([segment.recording * 1_000_000 + int(segment.t_s[row] / block_s) for segment, row in starts]),
         in_event=np.array([segment.in_event[row : row + steps + 1].any() for segment, row in starts]),
-        command_deviations=_deviations(starts, history_rows(period_s), steps),
+        command_deviations=_deviations(starts, past, steps),
     )
 
 
