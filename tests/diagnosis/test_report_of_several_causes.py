@@ -68,7 +68,7 @@ def test_line_states_that_an_effect_may_be_absent() -> None:
     (present,) = effect_lines(with_texts(diagnosis("mismatch", damping)))
     absent = replace(damping, parameters={"coefficient": Estimate(0.012, 0.01, 0.0, 0.029, "N m s/rad")})
     (uncertain,) = effect_lines(with_texts(diagnosis("mismatch", absent)))
-    assert uncertain.endswith(" The interval contains a car without the effect.")
+    assert uncertain.endswith(" Its 90 % interval includes the value without the effect.")
     assert "without the effect" not in present
     stated = replace(absent, car_file_values={"coefficient": 0.05})
     assert "without the effect" not in effect_lines(with_texts(diagnosis("mismatch", stated)))[0]

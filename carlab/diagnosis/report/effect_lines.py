@@ -30,7 +30,7 @@ def _uncertainty(effect: EffectFinding) -> str:
     elif probability < REPORT.uncertain_probability:
         sentences.append(f"Probably none of these names is correct (probability of one: {percent(probability)}).")
     if _may_be_absent(effect):
-        sentences.append("The interval contains a car without the effect.")
+        sentences.append("Its 90 % interval includes the value without the effect.")
     return " ".join(sentences)
 
 
