@@ -19,8 +19,6 @@ from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.array_rollout import array_rollout
 from sim_backends.batch.inputs import with_effects_of_values
-from sim_backends.batch.operator_rollout import operator_rollout
-from sim_backends.batch.rollout import Engine
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, DynamicsEffect
 from sim_backends.measurement import (
@@ -108,7 +106,6 @@ def simulate_windows(
     max_step_s: float | None = None,
     ticks: IndexArray | None = None,
     in_double: bool = False,
-    engine: Engine = "fastest",
 ) -> FloatArray:
     """Predict windows by a simulator with P parameter sets.
 
@@ -120,7 +117,6 @@ def simulate_windows(
         max_step_s: maximum integration step; by default as long as the cars of the windows allow.
         ticks: indices (U,) of the ticks to return; all K + 1 by default.
         in_double: simulate with 64 instead of 32 bits, which takes twice as long; always done where 32 are not enough.
-        engine: of the rollouts.
 
     Returns:
         Predicted measurements (P, S, K + 1 or U, 6) in the order and units of ``PredictiveModel``.
@@ -136,8 +132,7 @@ def simulate_windows(
     dtype = np.float64 if in_double or is_far else np.float32
     parts, commands = windows.part_commands(dtype)
     used = measurement.ticks_in_use(ticks, windows.steps, windows.velocity_window_s2)
-    simulate = array_rollout if engine == "fastest" else operator_rollout
-    states = simulate(
+    states = array_rollout(
         whole.kind,
         effects,
         _car_without_measurement(numbers, effects, measurement) | {"timing.control_period": windows.period_s / parts},

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -91,8 +89,6 @@ class MeasuredCurve(Effect):
 
     def deviation(self, ops: Ops, coordinates: Sequence[Value], coefficients: Mapping[str, Value]) -> Value:
         """The deviation in ``unit`` at ``coordinates``, one value () or (cars,) for each axis in its unit."""
-        if (listener := _LISTENER.get()) is not None:
-            listener(self, coordinates)
         clipped = [
             [ops.clip(x, low, high) for low, high in itertools.pairwise(axis.knots)]
             for x, axis in zip(coordinates, self.axes, strict=True)
@@ -152,24 +148,6 @@ class MeasuredCurve(Effect):
                         row[places[place]] = mean * weight
                 rows.append(row)
         return np.array(rows)
-
-
-Listener = Callable[[MeasuredCurve, Sequence[Value]], None]
-"""Receives a curve and the coordinates, one value for each axis, at which it is evaluated."""
-_LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
-
-
-@contextmanager
-def report_evaluations(listener: Listener) -> Iterator[None]:
-    """Call ``listener`` with the coordinates of each evaluation of a measured curve by this thread.
-
-    Compiled code evaluates curves only while it is traced; ``rollout(engine="operators")`` evaluates them all.
-    """
-    token = _LISTENER.set(listener)
-    try:
-        yield
-    finally:
-        _LISTENER.reset(token)
 
 
 def free_knots(axes: Sequence[Axis]) -> list[tuple[int, ...]]:

@@ -14,6 +14,7 @@ from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, history_rows, segments_of
 from carlab.recording.pose_velocity import pose_motion
 from sim_backends.car_parameters import SimulatorConfig
+from tests.helpers.operator_rollout import operator_rollout
 
 CAR = default_car().simulator
 POSE_STD = np.array([3e-4, 3e-4, 2e-3])
@@ -120,11 +121,12 @@ def test_drives_of_different_rates_are_cut_together() -> None:
     assert np.abs(windows.command_deviations[windows.recording == 1]).max() < 1e-9
 
 
-def test_torch_operators_and_compiled_code_simulate_the_parts_of_cells_alike() -> None:
+def test_torch_operators_and_compiled_code_simulate_the_parts_of_cells_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(CAR, effects={"tyre_relaxation": {"length": 0.15}, "steering_lag": {"time_constant": 0.05}})
     episode = recorded(250.0, stepping(250.0, 8.0, 1), np.zeros(3), config)
     windows = cut_windows(segments_of([episode]), 1.0, 0.5)
     assert windows.command_deviations is not None
     by_code = simulate_windows(windows, config, in_double=True)
-    by_operators = simulate_windows(windows, config, in_double=True, engine="operators")
+    monkeypatch.setattr("carlab.prediction.predict.array_rollout", operator_rollout)
+    by_operators = simulate_windows(windows, config, in_double=True)
     assert np.allclose(by_code, by_operators, atol=1e-9)

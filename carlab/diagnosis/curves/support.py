@@ -13,12 +13,12 @@ from carlab.diagnosis.curves.curve_fit import CurveFit
 from carlab.diagnosis.curves.form_fit import identify_form
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.identification.fit_parameters import numbers_at
-from carlab.diagnosis.identification.knots_in_use import knot_weights
 from carlab.diagnosis.settings import CurveSettings
 from carlab.prediction.windows import RecordingSegment
-from sim_backends.array_ops import ARRAYS
+from sim_backends.array_ops import ARRAYS, Value
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CURVES, Forces, MeasuredCurve
+from sim_backends.effects.curves import weights
 
 MEASURED_CURVES = {curve.id: curve for curve in CURVES}
 
@@ -75,6 +75,18 @@ def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, segments: tupl
         coordinates = curve.coordinates(ARRAYS, recorded_forces(segment, config))
         total += segment.period_s * knot_weights(curve, coordinates, len(segment.t_s)).sum(axis=-1)
     return total
+
+
+def knot_weights(curve: MeasuredCurve, coordinates: Sequence[Value], count: int) -> FloatArray:
+    """Interpolation weights (A, n) or (A, B, n) of the knots of one or two axes at ``count`` = n points.
+
+    ``coordinates`` are those of the points on each axis, each (n,) or a number.
+    """
+    by_axis = [
+        np.stack(np.broadcast_arrays(*weights(ARRAYS, np.broadcast_to(np.asarray(x), count), axis.knots)))
+        for x, axis in zip(coordinates, curve.axes, strict=True)
+    ]
+    return by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] * by_axis[1][None]
 
 
 def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Forces:

@@ -7,7 +7,7 @@ outliers. Base parameters have priors (``fit_parameters``); parameters of effect
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,7 +24,6 @@ from carlab.diagnosis.identification.bounded_step import (
 )
 from carlab.diagnosis.identification.error_scale import Scale, huber, huber_weight
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, numbers_at, values_at
-from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import IDENTIFICATION
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import longest_step_s, simulate_windows
@@ -122,45 +121,25 @@ class Fitter:
         if len(z) > IDENTIFICATION.max_batch_sets:
             parts = np.array_split(z, math.ceil(len(z) / IDENTIFICATION.max_batch_sets))
             return np.concatenate([self.white(config, free, part, max_step_s) for part in parts])
-        return self._white(self.windows, config, {f.name: f.value(z[:, k]) for k, f in enumerate(free)}, max_step_s)
-
-    def _white(
-        self,
-        windows: PredictionWindows,
-        config: SimulatorConfig,
-        values: Mapping[str, FloatArray],
-        max_step_s: float | None,
-    ) -> FloatArray:
+        values = {f.name: f.value(z[:, k]) for k, f in enumerate(free)}
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
-            predicted = simulate_windows(windows, config, values, ticks=self.scale.steps, max_step_s=max_step_s)
-            return self.scale.white_at_steps(prediction_errors(predicted, windows, self.scale.steps))
+            predicted = simulate_windows(self.windows, config, values, ticks=self.scale.steps, max_step_s=max_step_s)
+            return self.scale.white_at_steps(prediction_errors(predicted, self.windows, self.scale.steps))
 
     def jacobian(
         self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray, white: FloatArray
     ) -> FloatArray:
         """Derivatives (n, S, U, 6) of the whitened errors ``white`` (S, U, 6) at coordinates z (n,), by differences.
 
-        At a bound they are those into the range. Only windows that a parameter may influence are simulated for it.
+        At a bound they are those into the range.
         """
-        values = values_at(free, z)
-        influences = influencing_parameters(self.windows, config, values)
-        max_step_s = longest_step_s(self.windows, config, values)
+        if not len(free):
+            return np.zeros((0, *white.shape))
+        max_step_s = longest_step_s(self.windows, config, values_at(free, z))
         steps = inward_steps(free, z, difference_steps(free))
-        jacobian = np.zeros((len(free), *white.shape))
-        everywhere = influences.all(axis=1)
-        moved = z + np.diag(steps)[everywhere]
-        if everywhere.any():
-            changed = self.white(config, free, moved, max_step_s)
-            jacobian[everywhere] = (changed - white) / steps[everywhere, None, None, None]
-        knots = np.flatnonzero(~everywhere)
-        batches = math.ceil(influences[knots].sum() / (max(len(self.windows), 1) * IDENTIFICATION.max_batch_sets))
-        for batch in np.array_split(knots, batches) if batches else ():
-            row, window = np.nonzero(influences[batch])
-            of_windows = dict(values)
-            for k, which in enumerate(batch):
-                of_windows[free[which].name] = np.atleast_2d(free[which].value(z[which] + steps[which] * (row == k)))
-            changed = self._white(self.windows.take(window), config, of_windows, max_step_s)[0]
-            jacobian[batch[row], window] = (changed - white[window]) / steps[batch[row], None, None]
+        jacobian = self.white(config, free, z + np.diag(steps), max_step_s)
+        jacobian -= white
+        jacobian /= steps[:, None, None, None]
         return jacobian
 
     def precision(self, free: Sequence[FitParameter]) -> FloatArray:
