@@ -18,6 +18,7 @@ from carlab.benchmark.proof import runner
 from carlab.benchmark.proof.runner import Proof
 from carlab.jobs.child_jobs import LocalExecutor
 from tests.helpers.command_line import Carlab
+from tests.helpers.jobs_here import ExecutorHere
 
 ROOT = Path(__file__).resolve().parents[2]
 FAKE_DIAGNOSIS = ROOT / "tests" / "benchmark" / "fake_diagnosis.py"
@@ -51,8 +52,8 @@ def proof_dir(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def sealed_null_proof(tmp_path_factory: pytest.TempPathFactory) -> Proof:
-    """A proof with two cases without an effect, which one process after another made."""
-    proof = Proof(tmp_path_factory.mktemp("null") / "proof", NULL_SPECS, executor=LocalExecutor(1))
+    """A proof with two cases without an effect, which this process made one after the other."""
+    proof = Proof(tmp_path_factory.mktemp("null") / "proof", NULL_SPECS, executor=ExecutorHere())
     assert proof.make() is not None
     return proof
 
@@ -174,7 +175,7 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
 
 @pytest.mark.parametrize("interrupts", [1, 2])
 def test_first_interrupt_finishes_the_running_case_and_second_drops_it(
-    interrupts: int, sealed_null_proof: Proof, tmp_path: Path
+    interrupts: int, sealed_null_proof: Proof, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, carlab: Carlab
 ) -> None:
     root = tmp_path / "proof"
     shutil.copytree(sealed_null_proof.root, root)
@@ -194,8 +195,9 @@ def test_first_interrupt_finishes_the_running_case_and_second_drops_it(
     n_done = len(list((root / "reports").glob("*/run.json")))
     assert n_done == (1 if interrupts == 1 else 0)
     assert f"Stopped with {n_done} of 2 cases diagnosed; run the same command to continue." in " ".join(output.split())
-    (root / "go").touch()
-    resumed = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert resumed.returncode == 0, resumed.stdout + resumed.stderr
+    monkeypatch.setattr(proof_set, "short_set", lambda purpose, seed=0: NULL_SPECS)
+    monkeypatch.setattr(runner, "DIAGNOSE", (sys.executable, str(FAKE_DIAGNOSIS)))
+    code, text = carlab("prove", "--out", root, "--no-baselines", "--no-oracle")
+    assert code == 0, text
     reports = [json.loads(path.read_text()) for path in (root / "reports").glob("*/run.json")]
     assert [report["exit_status"] for report in reports] == [0, 0]
