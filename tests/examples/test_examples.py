@@ -1,11 +1,9 @@
 """Test that each script in examples/ runs with small settings and prints its results."""
 
-import os
 import re
 import runpy
-import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +14,8 @@ from carlab.core.angles import wrap
 from carlab.core.observation import encode
 from carlab.core.task import Task
 from learning.policy.sac_agent import SacSettings
+from sim_backends.effects import CATALOGUE, EFFECTS
+from sim_backends.registry import REGISTRY
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 FEW_STEPS = ["--updates", "64", "--model-steps", "20"]
@@ -48,15 +48,14 @@ def output_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Cap
     return run
 
 
-def output_of_process(script: str, folder: Path) -> str:
-    """Run a script as a program of its own; returns what it prints."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / script), *SCRIPTS[script], "--out", "runs"],
-        cwd=folder, capture_output=True, text=True, check=False, env=environment, timeout=900,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def registries() -> Iterator[None]:
+    """Remove what the test registers."""
+    before = [(registry, dict(registry)) for registry in (EFFECTS, CATALOGUE, REGISTRY)]
+    yield
+    for registry, entries in before:
+        registry.clear()
+        registry.update(entries)
 
 
 def test_each_example_has_settings() -> None:
@@ -196,9 +195,9 @@ def test_own_task_rewards_its_end_more_than_waiting_or_leaving() -> None:
 
 
 @pytest.mark.timeout(900)
-def test_own_effect_is_identified(tmp_path: Path) -> None:
-    """In a process of its own, because the script registers an effect for the rest of the process."""
-    text = output_of_process("add_effect.py", tmp_path)
+@pytest.mark.usefixtures("registries")
+def test_own_effect_is_identified(output_of: Example) -> None:
+    text = output_of("add_effect.py")
     estimated = text.partition("a drag of ")[2].split()[0]
     assert float(estimated) == pytest.approx(0.5, abs=0.1)
 
