@@ -270,7 +270,7 @@ def _diagnosed(
 
 def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: RecordingNoise | None = None) -> CarFile:
     from carlab.cars import CarFile
-    from carlab.diagnosis.report.write import model_toml, with_parameter_std
+    from carlab.diagnosis.report.model_file import model_toml, with_parameter_std
 
     text = model_toml(diagnosis, simulator, noise)
     return CarFile(f"{name} (diagnosed)", text, with_parameter_std(diagnosis, simulator), None, noise)

@@ -13,10 +13,10 @@ from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.report.curves import ceiling_sentence, curves_advice
 from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.report.html_page import render_page
+from carlab.diagnosis.report.model_file import model_toml
 from carlab.diagnosis.report.next_drive import next_drive, with_texts
 from carlab.diagnosis.report.residual import shown_errors
 from carlab.diagnosis.report.sentences import regime_clause, verdict_sentence, verdict_title
-from carlab.diagnosis.report.write import model_toml
 from carlab.diagnosis.selection.problem import Candidate, RunControl
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends import SimulatorConfig

@@ -12,9 +12,9 @@ from carlab.diagnosis.findings import Diagnosis, EffectFinding, ErrorLocation, E
 from carlab.diagnosis.identification.error_scale import Scale
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.report.model_file import with_parameter_std
 from carlab.diagnosis.report.next_drive import with_texts
 from carlab.diagnosis.report.sentences import effect_sentence, verdict_sentence
-from carlab.diagnosis.report.write import with_parameter_std
 from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.selection.screening import Screen
 from carlab.diagnosis.settings import DEFAULT, IDENTIFICATION
