@@ -35,23 +35,20 @@ LOG_MEDIAN_VARIANCE = 1.36
 """Variance of the logarithm of a sample's median |z|, times the sample size: ``1 / (4 f(m)^2 m^2)``, z normal."""
 
 
-def initial_row_weights(residual: Tensor, covariance: Callable[[Tensor], Tensor], noise_std: Tensor) -> Tensor:
+def initial_row_weights(weights: Tensor, standardised_errors: Callable[[Tensor], Tensor]) -> Tensor:
     """Weights (n,) of rows under the prior covariance: low for rows that a typical discrepancy does not explain.
 
     The weights precede the fit of the covariance, because a fitted covariance would follow gross outliers.
 
     Args:
-        residual: of a simulator (n, O).
-        covariance: prior covariance of the rows (O, n, n) for given weights.
-        noise_std: prior noise (O,).
+        weights: initial weights (n,), all 1.
+        standardised_errors: leave-one-out errors of a simulator's residual (n, O) for given weights.
     """
-    weights = torch.ones(len(residual), dtype=residual.dtype, device=residual.device)
     for _ in range(INITIAL_WEIGHT_ITERATIONS):
-        standardised, _ = leave_one_out(residual, covariance(weights), noise_std, weights)
-        square = standardised**2
+        square = standardised_errors(weights) ** 2
         # The median row determines the scale; the result does not depend on the size of the prior covariance.
         median_excess = (square.median(dim=0).values / _MEDIAN_CHI2).clamp_min(1.0)
-        _, weights = student_weights((square / median_excess).sum(dim=1), residual.shape[1])
+        _, weights = student_weights((square / median_excess).sum(dim=1), square.shape[1])
     return weights
 
 

@@ -54,6 +54,14 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    @property
+    def step_numbers(self) -> np.ndarray:
+        """A number of each row (n,); numbers differ by 1 exactly between consecutive steps of an episode."""
+        if not len(self):
+            return self.tick
+        numbers: np.ndarray = self.tick + self.episode * (int(self.tick.max()) + 2)
+        return numbers
+
     def take(self, rows: np.ndarray) -> Transitions:
         """Some of the rows, by index (m,) or mask (n,)."""
         return Transitions(self.inputs[rows], self.targets[rows], self.episode[rows], self.tick[rows], self.history)

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from learning.networks.adam import Adam, half_cosine
+from learning.posterior.row_noise import FIT_BLOCK_ROWS, RowNoise, prior_logs, random_rows
 
 STEPS = 120
 LEARNING_RATE, FINAL_RATE_SHARE = 0.08, 0.05
@@ -32,15 +33,15 @@ CHOLESKY_JITTER = 1e-6
 PRIOR_DISCREPANCY_STD = 0.3
 """Default prior size of the discrepancy in normalised outputs."""
 PRIOR_LENGTHSCALE = 3.0
-LOG_STD_SCALE, LOG_STD_SHAPE, LOG_STD_NOISE = 1.0, 0.3, 0.5
-"""Prior standard deviations of logarithms: of sizes, of lengthscales and slopes of each output, of the noise."""
+LOG_STD_SCALE, LOG_STD_SHAPE = 1.0, 0.3
+"""Prior standard deviations of logarithms: of sizes, of lengthscales and slopes of each output."""
 LOG_STD_OUTPUT_FACTOR, LOG_STD_INPUT_FACTOR = 1.0, 1.0
 """The same of a common factor on all sizes of an output, and on the lengthscales of all outputs along an input."""
 LOG_STDS = (
     *(LOG_STD_SCALE, LOG_STD_SHAPE, LOG_STD_SHAPE, LOG_STD_SCALE, LOG_STD_SCALE, LOG_STD_SHAPE),
-    *(LOG_STD_NOISE, LOG_STD_OUTPUT_FACTOR, LOG_STD_INPUT_FACTOR),
+    *(LOG_STD_OUTPUT_FACTOR, LOG_STD_INPUT_FACTOR),
 )
-"""The same for a covariance's six parts in their order, the noise, and the two factors."""
+"""The same for a covariance's six parts in their order, and the two factors."""
 
 Evaluated = tuple[Tensor, Callable[[Tensor], list[Tensor]]]
 """A covariance, and the map from a gradient with respect to it to gradients with respect to its hyperparameters."""
@@ -166,7 +167,8 @@ def fit_discrepancy(
     simulated_mean: Tensor | None = None,
     seed: int = 0,
     multiplier_share: float = 1.0,
-) -> tuple[DiscrepancyCovariance, Tensor]:
+    step_numbers: Tensor | None = None,
+) -> tuple[DiscrepancyCovariance, RowNoise]:
     """Fit the covariance of the discrepancy and the noise by the evidence.
 
     With more than ``BATCH_ROWS`` rows the gradient is stochastic (Chen et al. 2020, "Stochastic gradient descent in
@@ -184,9 +186,10 @@ def fit_discrepancy(
         simulated_mean: normalised outputs of the simulator (n, O), if any.
         seed: of the subsets of rows.
         multiplier_share: prior size of the multiplicative part relative to the others.
+        step_numbers: of the rows' steps (n,), as for ``RowNoise``; None: the noise of rows is independent.
 
     Returns:
-        The covariance and the noise (O,).
+        The covariance and the noise.
     """
     residual, inputs = residual.double(), inputs.double()
     start = DiscrepancyCovariance.at_prior_median(inputs.shape[1], prior_std, multiplier_share)
@@ -196,12 +199,12 @@ def fit_discrepancy(
         start.multiplier_lengthscales,
     )  # fmt: skip
     factors = [torch.zeros_like(start.scales), torch.zeros_like(start.lengthscales[0])]
-    medians = [*(v.log() for v in parts), noise_std.double().log(), *factors]
+    of_noise, noise_stds = prior_logs(noise_std, step_numbers)
+    medians = [*(v.log() for v in parts), *factors, *of_noise]
 
     def evaluate(logs: list[Tensor], rows: Tensor) -> Evaluated:
         covariance, part_gradients = _covariance_of(logs).with_pullback(inputs[rows])
-        noise_variance = _noise_variance(logs[6], row_weights[rows])
-        covariance.diagonal(dim1=1, dim2=2).add_(noise_variance + CHOLESKY_JITTER)
+        noise_gradients = _add_noise(covariance, RowNoise.of_logs(logs[8:], step_numbers).take(rows), row_weights[rows])
         if parameter_covariance is not None:
             covariance += _of_rows(parameter_covariance, rows)
 
@@ -210,28 +213,42 @@ def fit_discrepancy(
             scales, lengthscales, slopes, offsets, multiplier_stds, multiplier_lengthscales = by_parts
             by_output = scales + slopes.sum(dim=1) + offsets + multiplier_stds
             by_input = (lengthscales + multiplier_lengthscales).sum(dim=0)
-            return [*by_parts, _noise_gradient(gradient, noise_variance), by_output, by_input]
+            return [*by_parts, by_output, by_input, *noise_gradients(gradient)]
 
         return covariance, pullback
 
-    logs = _maximise_posterior(medians, LOG_STDS, residual, evaluate, seed)
-    return _covariance_of(logs), logs[6].exp()
+    logs = _maximise_posterior(medians, (*LOG_STDS, *noise_stds), residual, evaluate, seed, step_numbers)
+    return _covariance_of(logs), RowNoise.of_logs(logs[8:], step_numbers)
 
 
 def fit_noise(
-    residual: Tensor, parameter_covariance: Tensor | None, noise_std: Tensor, row_weights: Tensor, seed: int = 0
-) -> Tensor:
-    """Fit the noise (O,) alone, for a simulator without discrepancy; arguments as for ``fit_discrepancy``."""
+    residual: Tensor,
+    parameter_covariance: Tensor | None,
+    noise_std: Tensor,
+    row_weights: Tensor,
+    seed: int = 0,
+    step_numbers: Tensor | None = None,
+) -> RowNoise:
+    """Fit the noise alone, for a simulator without discrepancy; arguments as for ``fit_discrepancy``."""
+    medians, stds = prior_logs(noise_std, step_numbers)
+    outputs = len(noise_std)
 
     def evaluate(logs: list[Tensor], rows: Tensor) -> Evaluated:
-        noise_variance = _noise_variance(logs[0], row_weights[rows])
-        covariance = torch.diag_embed(noise_variance + CHOLESKY_JITTER)
+        covariance = row_weights.new_zeros((outputs, len(rows), len(rows)), dtype=torch.float64)
+        gradients = _add_noise(covariance, RowNoise.of_logs(logs, step_numbers).take(rows), row_weights[rows])
         if parameter_covariance is not None:
             covariance += _of_rows(parameter_covariance, rows)
-        return covariance, lambda gradient: [_noise_gradient(gradient, noise_variance)]
+        return covariance, gradients
 
-    medians = [noise_std.double().log()]
-    return _maximise_posterior(medians, (LOG_STD_NOISE,), residual.double(), evaluate, seed)[0].exp()
+    logs = _maximise_posterior(medians, stds, residual.double(), evaluate, seed, step_numbers)
+    return RowNoise.of_logs(logs, step_numbers)
+
+
+def _add_noise(covariance: Tensor, noise: RowNoise, row_weights: Tensor) -> Callable[[Tensor], list[Tensor]]:
+    """Add noise to covariances (O, n, n) in place; returns the pullback to the logarithms of the noise."""
+    noise.add_to(covariance, row_weights)
+    covariance.diagonal(dim1=1, dim2=2).add_(CHOLESKY_JITTER)
+    return lambda gradient: noise.log_gradients(gradient, row_weights)
 
 
 def _maximise_posterior(
@@ -240,6 +257,7 @@ def _maximise_posterior(
     residual: Tensor,
     evaluate: Callable[[list[Tensor], Tensor], Evaluated],
     seed: int,
+    step_numbers: Tensor | None,
 ) -> list[Tensor]:
     """Logarithms of hyperparameters at the maximum of evidence times Gaussian priors, by Adam.
 
@@ -249,6 +267,7 @@ def _maximise_posterior(
         residual: zero-mean Gaussian (n, O), or draws of it (P, n, O).
         evaluate: covariance (O, m, m) of the rows with indices (m,) for given logarithms, and its pullback.
         seed: of the subsets of rows.
+        step_numbers: of the rows' steps (n,), if known.
     """
     generator, count = torch.Generator().manual_seed(seed), residual.shape[-2]
     rows = torch.arange(count, device=residual.device)
@@ -256,7 +275,7 @@ def _maximise_posterior(
     optimisers = [Adam(value) for value in logs]
     for step in range(STEPS):
         if count > BATCH_ROWS and step % STEPS_PER_BATCH == 0:
-            rows = torch.randperm(count, generator=generator)[:BATCH_ROWS].to(residual.device)
+            rows = random_rows(count, BATCH_ROWS, step_numbers, generator, FIT_BLOCK_ROWS).to(residual.device)
         covariance, pullback = evaluate(logs, rows)
         gradients = pullback(evidence_gradient(residual[..., rows, :], covariance))
         rate = LEARNING_RATE * half_cosine(step, STEPS, FINAL_RATE_SHARE)
@@ -271,19 +290,9 @@ def _of_rows(covariance: Tensor, rows: Tensor) -> Tensor:
     return covariance if len(rows) == covariance.shape[1] else covariance[:, rows][:, :, rows]
 
 
-def _noise_variance(log_noise: Tensor, row_weights: Tensor) -> Tensor:
-    """Noise variance of each output and row (O, n)."""
-    return torch.exp(2.0 * log_noise)[:, None] / row_weights
-
-
-def _noise_gradient(gradient: Tensor, variance: Tensor) -> Tensor:
-    """Gradient (O,) with respect to the log noise, from one with respect to the covariance (O, n, n)."""
-    return 2.0 * (gradient.diagonal(dim1=1, dim2=2) * variance).sum(dim=1)
-
-
 def _covariance_of(logs: list[Tensor]) -> DiscrepancyCovariance:
-    """The covariance, from logarithms of its six parts, of the noise, and of the factors by output and by input."""
-    scales, lengthscales, slopes, offsets, multiplier_stds, multiplier_lengthscales, _, by_output, by_input = logs
+    """The covariance, from logarithms of its six parts and of the factors by output and by input; ignores others."""
+    scales, lengthscales, slopes, offsets, multiplier_stds, multiplier_lengthscales, by_output, by_input = logs[:8]
     return DiscrepancyCovariance(
         (scales + by_output).exp(), (lengthscales + by_input).exp(), (slopes + by_output[:, None]).exp(),
         (offsets + by_output).exp(), (multiplier_stds + by_output).exp(), (multiplier_lengthscales + by_input).exp(),

@@ -14,7 +14,6 @@ from learning.networks.normaliser import Normaliser
 from learning.outliers import (
     decorrelation_of,
     initial_row_weights,
-    leave_one_out,
     leave_one_out_log_density,
     mahalanobis_sq,
     median_scale,
@@ -30,6 +29,7 @@ from learning.posterior.discrepancy import (
 )
 from learning.posterior.function_posterior import FunctionPosterior, simulate
 from learning.posterior.parameter_posterior import posterior_parameters
+from learning.posterior.row_noise import FIT_BLOCK_ROWS, RowNoise, prior_logs, random_rows
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, DomainModel, draw_parameters
 from learning.priors.function_prior import moments
 
@@ -71,6 +71,7 @@ def infer(
     discrepancy_std: Tensor | None = None,
     with_discrepancy: bool = True,
     noise_known: bool = False,
+    step_numbers: Tensor | None = None,
     restart_scales: Sequence[float] = RESTART_SCALES,
     seed: int = 0,
 ) -> FunctionPosterior:
@@ -87,6 +88,8 @@ def infer(
         with_discrepancy: whether the model has a discrepancy.
         noise_known: whether the noise is fixed at ``noise_std``; ignored with a discrepancy, which needs fitted noise.
             Student-t tails and the noise's scale are always fitted from ``MIN_ROWS_STUDENT`` rows on.
+        step_numbers: of the rows' steps (n,); those of consecutive steps of a drive differ by 1, and the noise of such
+            rows is correlated (``row_noise``). None: the noise of rows is independent.
         restart_scales: factors on ``discrepancy_std``, one for each fit; all but the first are used from
             ``MIN_ROWS_STUDENT`` rows on.
         seed: of all draws.
@@ -97,13 +100,14 @@ def infer(
     _check(inputs, outputs, normaliser, noise_std)
     if len(inputs) > MAX_ROWS:
         generator = torch.Generator().manual_seed(seed)
-        chosen = torch.randperm(len(inputs), generator=generator)[:MAX_ROWS].to(inputs.device)
+        chosen = random_rows(len(inputs), MAX_ROWS, step_numbers, generator).to(inputs.device)
         inputs, outputs = inputs[chosen], outputs[chosen]
+        step_numbers = None if step_numbers is None else step_numbers[chosen]
     default_std = PRIOR_DISCREPANCY_STD * torch.ones_like(noise_std)
     prior_std = default_std if discrepancy_std is None else discrepancy_std / normaliser.output_std
     problem = _Problem(
         model, inputs, outputs, normaliser, (noise_std / normaliser.output_std).double(), prior_std.double(),
-        with_discrepancy, noise_known, seed,
+        with_discrepancy, noise_known, seed, step_numbers,
     )  # fmt: skip
     if with_discrepancy and problem.has_student_noise:
         return _best_of_restarts(problem, restart_scales)
@@ -132,11 +136,17 @@ class _Problem:
     with_discrepancy: bool
     noise_known: bool
     seed: int
+    step_numbers: Tensor | None
 
     @property
     def has_student_noise(self) -> bool:
         """Whether there are enough rows for Student-t noise."""
         return len(self.inputs) >= MIN_ROWS_STUDENT
+
+    @property
+    def prior_noise(self) -> RowNoise:
+        """Prior median of the noise."""
+        return RowNoise.of_logs(prior_logs(self.noise_std, self.step_numbers)[0], self.step_numbers)
 
     @property
     def multiplier_share(self) -> float:
@@ -176,7 +186,7 @@ class _Estimate:
         parameters: draws (P, K).
         residual: of the simulator with these parameters.
         discrepancy: its covariance.
-        noise_std: (O,).
+        noise: of the rows.
         noise_prior_std: prior median of the noise in the next fit (O,).
         row_weights: Student-t weights (n,).
         correlation: of leave-one-out errors (O, O).
@@ -189,7 +199,7 @@ class _Estimate:
     parameters: Tensor | None
     residual: _Residual
     discrepancy: DiscrepancyCovariance | None
-    noise_std: Tensor
+    noise: RowNoise
     noise_prior_std: Tensor
     row_weights: Tensor
     correlation: Tensor
@@ -200,15 +210,19 @@ class _Estimate:
     def covariance(self, rows: Tensor | None = None) -> Tensor:
         """Covariances (O, m, m) of discrepancy and noise of the rows with indices (m,), or of all rows."""
         inputs, weights = self.residual.inputs, self.row_weights
-        if rows is not None:
-            inputs, weights = inputs[rows], weights[rows]
-        return _covariance(self.discrepancy, inputs, self.noise_std, weights)
+        if rows is None:
+            return _covariance(self.discrepancy, inputs, self.noise, weights)
+        return _covariance(self.discrepancy, inputs[rows], self.noise.take(rows), weights[rows])
 
-    def covariance_with_parameters(self, row_weights: Tensor) -> Tensor:
-        """Covariances (O, n, n) of discrepancy, noise and outputs of the parameter draws, for weights (n,)."""
-        prior = _covariance(self.discrepancy, self.residual.inputs, self.noise_std, row_weights)
-        of_parameters = self.residual.parameter_covariance
-        return prior if of_parameters is None else prior + of_parameters
+    def leave_one_out(self, row_weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Standardised errors of the rows (n, O) and their variances, of ``RowNoise.leave_one_out``, for weights (n,).
+
+        The covariance is that of discrepancy, noise and outputs of the parameter draws.
+        """
+        covariance = _covariance(self.discrepancy, self.residual.inputs, self.noise, row_weights)
+        if self.residual.parameter_covariance is not None:
+            covariance += self.residual.parameter_covariance
+        return self.noise.leave_one_out(self.residual.mean, covariance, row_weights)
 
 
 def _best_of_restarts(problem: _Problem, scales: Sequence[float]) -> FunctionPosterior:
@@ -246,7 +260,8 @@ def _fit(problem: _Problem, known_parameters: Tensor | None = None) -> tuple[Fun
     """
     generator = torch.Generator().manual_seed(problem.seed)
     count = len(problem.inputs)
-    rows = torch.randperm(count, generator=generator)[:PARAMETER_ROWS].to(problem.inputs.device)
+    rows = random_rows(count, PARAMETER_ROWS, problem.step_numbers, generator, FIT_BLOCK_ROWS)
+    rows = rows.to(problem.inputs.device)
     estimate = _initial_estimate(problem, known_parameters, generator)
     for iteration in range(ITERATIONS if count else 0):
         last = iteration == ITERATIONS - 1
@@ -262,7 +277,7 @@ def _fit(problem: _Problem, known_parameters: Tensor | None = None) -> tuple[Fun
 
 def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, generator: torch.Generator) -> _Estimate:
     """Prior medians, draws of the prior parameters, and the row weights that follow from them."""
-    count, noise = len(problem.inputs), problem.noise_std
+    count, noise = len(problem.inputs), problem.prior_noise
     parameters = known_parameters
     if problem.model is not None and parameters is None:
         parameters = _prior_parameters(problem, problem.model, generator)
@@ -274,12 +289,12 @@ def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, genera
         )
     residual = _residual(problem, parameters, problem.normaliser, given_rows=known_parameters is not None)
     estimate = _Estimate(
-        problem.normaliser, parameters, residual, discrepancy, noise, noise, ones,
-        torch.eye(len(noise), dtype=torch.float64, device=problem.inputs.device), problem.max_dof,
-        torch.ones_like(noise), torch.zeros_like(ones),
+        problem.normaliser, parameters, residual, discrepancy, noise, noise.std, ones,
+        torch.eye(len(noise.std), dtype=torch.float64, device=problem.inputs.device), problem.max_dof,
+        torch.ones_like(noise.std), torch.zeros_like(ones),
     )  # fmt: skip
     if problem.has_student_noise:
-        estimate.row_weights = initial_row_weights(residual.mean, estimate.covariance_with_parameters, noise)
+        estimate.row_weights = initial_row_weights(ones, lambda weights: estimate.leave_one_out(weights)[0])
     return estimate
 
 
@@ -298,12 +313,13 @@ def _fit_covariance(problem: _Problem, estimate: _Estimate) -> None:
     width, given = problem.inputs.shape[1], residual.posterior
     rows = (residual.mean, residual.parameter_covariance) if given is None else (given, None)
     if problem.with_discrepancy:
-        estimate.discrepancy, estimate.noise_std = fit_discrepancy(
+        estimate.discrepancy, estimate.noise = fit_discrepancy(
             residual.inputs[:, :width], *rows, noise_prior, problem.discrepancy_std, estimate.row_weights,
             None if problem.model is None else residual.inputs[:, width:], problem.seed, problem.multiplier_share,
+            problem.step_numbers,
         )  # fmt: skip
     elif not problem.noise_known:
-        estimate.noise_std = fit_noise(*rows, noise_prior, estimate.row_weights, problem.seed)
+        estimate.noise = fit_noise(*rows, noise_prior, estimate.row_weights, problem.seed, problem.step_numbers)
 
 
 def _infer_parameters(problem: _Problem, estimate: _Estimate, rows: Tensor, generator: torch.Generator) -> None:
@@ -323,11 +339,10 @@ def _fit_student_noise(problem: _Problem, estimate: _Estimate) -> tuple[Tensor, 
     Returns:
         Scales (O,) of the standardised leave-one-out errors, and their predictive variances (n, O).
     """
-    noise = estimate.noise_std
-    covariance = estimate.covariance_with_parameters(estimate.row_weights)
-    standardised, variance = leave_one_out(estimate.residual.mean, covariance, noise, estimate.row_weights)
+    standardised, variance = estimate.leave_one_out(estimate.row_weights)
     estimate.correlation, width = output_correlation(standardised)
-    dof, estimate.row_weights = student_weights(mahalanobis_sq(standardised, estimate.correlation), len(noise))
+    square = mahalanobis_sq(standardised, estimate.correlation)
+    dof, estimate.row_weights = student_weights(square, standardised.shape[1])
     estimate.dof = min(dof, problem.max_dof)
     estimate.scale = median_scale(standardised**2, estimate.dof)
     log_det = estimate.normaliser.decorrelation_log_det
@@ -338,7 +353,7 @@ def _fit_student_noise(problem: _Problem, estimate: _Estimate) -> tuple[Tensor, 
 def _decorrelate_outputs(problem: _Problem, estimate: _Estimate, width: Tensor, variance: Tensor) -> None:
     """Transform the outputs so that leave-one-out errors are uncorrelated, and update the residual."""
     # A constant output does not determine its noise; the lower bound holds.
-    estimate.noise_prior_std = torch.maximum(width * estimate.noise_std, MIN_NOISE_SHARE * problem.noise_std)
+    estimate.noise_prior_std = torch.maximum(width * estimate.noise.std, MIN_NOISE_SHARE * problem.noise_std)
     error_std = width * variance.median(dim=0).values.sqrt()
     estimate.normaliser = estimate.normaliser.decorrelated(decorrelation_of(estimate.correlation, error_std))
     estimate.residual = _residual(problem, estimate.parameters, estimate.normaliser)
@@ -355,7 +370,7 @@ def _condition(problem: _Problem, estimate: _Estimate) -> FunctionPosterior:
         plausible = _plausible(simulated)
         parameters, residuals = parameters[plausible], targets - simulated[plausible]
     whitened = torch.linalg.solve_triangular(cholesky, residuals.permute(2, 1, 0), upper=False)
-    noise_std = torch.maximum(estimate.scale * estimate.noise_std, MIN_NOISE_SHARE * problem.noise_std).float()
+    noise_std = torch.maximum(estimate.scale * estimate.noise.std, MIN_NOISE_SHARE * problem.noise_std).float()
     return FunctionPosterior(
         normaliser, noise_std, estimate.dof, estimate.correlation.float(), model, parameters, estimate.discrepancy,
         estimate.residual.inputs, cholesky, whitened,
@@ -389,8 +404,11 @@ def _plausible(simulated: Tensor) -> Tensor:
 
 
 def _covariance(
-    discrepancy: DiscrepancyCovariance | None, inputs: Tensor, noise_std: Tensor, row_weights: Tensor
+    discrepancy: DiscrepancyCovariance | None, inputs: Tensor, noise: RowNoise, row_weights: Tensor
 ) -> Tensor:
     """Covariances (O, n, n) of discrepancy and noise; a row's noise variance is divided by its weight."""
-    noise = torch.diag_embed((noise_std**2)[:, None] / row_weights + CHOLESKY_JITTER)
-    return noise if discrepancy is None else discrepancy(inputs) + noise
+    covariance = (
+        noise.covariance(row_weights) if discrepancy is None else noise.add_to(discrepancy(inputs), row_weights)
+    )
+    covariance.diagonal(dim1=1, dim2=2).add_(CHOLESKY_JITTER)
+    return covariance

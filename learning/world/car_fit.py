@@ -30,6 +30,7 @@ from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
 from learning.posterior.inference import infer
 from learning.posterior.particle_posterior import ParticlePosterior, ParticleSimulator
+from learning.posterior.row_noise import random_rows
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, draw_parameters
 from learning.priors.simulator_model import CarModel
 from learning.priors.simulator_text import model_of, text_of
@@ -140,18 +141,17 @@ def fit_car(
     earlier_units = None if earlier is None else earlier.posterior.normaliser.without_decorrelation()
     units = (car_units(model, generator) if earlier_units is None else earlier_units).to(device)
     width = 3 + 2 * (model.history + 1)
-    inputs, outputs = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS)))
+    inputs, outputs, step_numbers = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS))), None
     if rows is not None and len(rows):
         inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
-    if len(inputs) > MAX_ROWS:
-        chosen = torch.randperm(len(inputs), generator=generator)[:MAX_ROWS]
-        inputs, outputs = inputs[chosen], outputs[chosen]
-    inputs, outputs = inputs.to(device), outputs.to(device)
+        step_numbers = torch.from_numpy(rows.step_numbers)
+        chosen = random_rows(len(inputs), MAX_ROWS, step_numbers, generator)
+        inputs, outputs, step_numbers = (v[chosen].to(device) for v in (inputs, outputs, step_numbers))
     with_simulator = settings.method == "gp-sim-posterior"
     discrepancy_std = (PRIOR_DISCREPANCY if with_simulator else PRIOR_FUNCTION) * units.output_std
     target = infer(
         model if with_simulator else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device),
-        discrepancy_std=discrepancy_std, restart_scales=(1.0,), seed=settings.seed,
+        discrepancy_std=discrepancy_std, step_numbers=step_numbers, restart_scales=(1.0,), seed=settings.seed,
     )  # fmt: skip
     correct = settings.kind == "simulator" and with_simulator
     particles = DistillationSettings(

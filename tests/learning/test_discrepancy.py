@@ -12,7 +12,6 @@ from learning.posterior import discrepancy as discrepancy_module
 from learning.posterior.discrepancy import (
     CHOLESKY_JITTER,
     LOG_STD_INPUT_FACTOR,
-    LOG_STD_NOISE,
     LOG_STD_OUTPUT_FACTOR,
     LOG_STD_SCALE,
     LOG_STD_SHAPE,
@@ -21,6 +20,7 @@ from learning.posterior.discrepancy import (
     evidence_gradient,
     fit_discrepancy,
 )
+from learning.posterior.row_noise import LOG_STD_NOISE
 
 
 def positive(*shape, seed=0):
@@ -183,7 +183,7 @@ def test_fit_is_close_to_the_maximum_a_posteriori():
     found = np.log(
         [
             float(v.squeeze())
-            for v in (discrepancy.scales, discrepancy.lengthscales, discrepancy.slopes, discrepancy.offsets, noise)
+            for v in (discrepancy.scales, discrepancy.lengthscales, discrepancy.slopes, discrepancy.offsets, noise.std)
         ]
     )
     best = minimize(nll, medians, method="L-BFGS-B")
@@ -206,7 +206,7 @@ def process():
     discrepancy, noise = fit_discrepancy(
         torch.tensor(x[:150]), torch.tensor(y[:150]), None, torch.tensor([0.2, 0.2]), expected, torch.ones(150)
     )
-    return x, y, discrepancy, noise
+    return x, y, discrepancy, noise.std
 
 
 class TestKnownProcess:
@@ -246,8 +246,8 @@ def test_minibatches_use_all_rows(monkeypatch):
     y = np.sin(2 * x) + spread * rng.normal(size=x.shape)
     tensors = [torch.tensor(v) for v in (x, y)]
     settings = (torch.tensor([0.2]), torch.tensor([0.5]))
-    noises = [float(fit_discrepancy(*tensors, None, *settings, torch.ones(240), seed=k)[1]) for k in range(3)]
-    first = float(fit_discrepancy(*(v[:60] for v in tensors), None, *settings, torch.ones(60))[1])
+    noises = [float(fit_discrepancy(*tensors, None, *settings, torch.ones(240), seed=k)[1].std) for k in range(3)]
+    first = float(fit_discrepancy(*(v[:60] for v in tensors), None, *settings, torch.ones(60))[1].std)
     # The common noise is the root mean square of both halves.
     common_noise = math.sqrt(0.5 * (0.1**2 + 0.3**2))
     assert np.allclose(noises, common_noise, rtol=0.15)
@@ -266,7 +266,7 @@ def test_parameter_uncertainty_is_not_attributed_to_the_discrepancy():
     query = torch.tensor([[2.0]], dtype=torch.float64)
     assert float(exact(query)) > 1.0
     assert float(uncertain(query)) < 0.1
-    assert float(noise) == pytest.approx(0.05, rel=0.3)
+    assert float(noise.std) == pytest.approx(0.05, rel=0.3)
 
 
 def test_rows_of_low_weight_do_not_change_the_noise():
@@ -277,8 +277,8 @@ def test_rows_of_low_weight_do_not_change_the_noise():
     row_weights[::5] = 1.0 / 400.0
     y = 0.5 * x + 0.1 * torch.tensor(rng.normal(size=(100, 1))) / row_weights[:, None].sqrt()
     expected = (torch.tensor([0.15]), torch.tensor([0.3]))
-    assert float(fit_discrepancy(x, y, None, *expected, row_weights)[1]) == pytest.approx(0.1, rel=0.2)
-    assert float(fit_discrepancy(x, y, None, *expected, torch.ones(100))[1]) > 0.4
+    assert float(fit_discrepancy(x, y, None, *expected, row_weights)[1].std) == pytest.approx(0.1, rel=0.2)
+    assert float(fit_discrepancy(x, y, None, *expected, torch.ones(100))[1].std) > 0.4
 
 
 def test_discrepancy_is_zero_where_the_simulator_is_correct():
@@ -293,6 +293,6 @@ def test_discrepancy_is_zero_where_the_simulator_is_correct():
     rows = torch.tensor(np.concatenate([x, simulated], axis=1))
     at = np.linspace(-1.8, -0.3, 40)[:, None]
     query = torch.tensor(np.concatenate([at, np.sin(3.0 * at)], axis=1))
-    covariance = discrepancy(rows)[0] + float(noise) ** 2 * torch.eye(80)
+    covariance = discrepancy(rows)[0] + float(noise.std) ** 2 * torch.eye(80)
     mean = discrepancy(query, rows)[0] @ torch.linalg.solve(covariance, tensors[1])
     assert float(mean.abs().max()) < 0.1

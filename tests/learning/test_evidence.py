@@ -10,8 +10,9 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
 from learning.networks.normaliser import Normaliser
-from learning.posterior.discrepancy import CHOLESKY_JITTER, LOG_STD_NOISE
+from learning.posterior.discrepancy import CHOLESKY_JITTER
 from learning.posterior.inference import infer
+from learning.posterior.row_noise import LOG_STD_NOISE
 
 UNITS = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
 NOISE = 0.1
