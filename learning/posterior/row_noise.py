@@ -71,20 +71,21 @@ class RowNoise:
 
     def add_to(self, covariance: Tensor, row_weights: Tensor) -> Tensor:
         """Add the covariances of the noise to others (O, n, n) in place; arguments as for ``covariance``."""
-        covariance.diagonal(dim1=1, dim2=2).add_((self.std**2)[:, None] / row_weights)
-        if self.measurement_share is not None and self.step_numbers is not None:
-            factor = -0.5 * self.measurement_share * self.std**2
-            covariance.add_(factor[:, None, None] * _neighbours(row_weights, self.step_numbers))
+        covariance.diagonal(dim1=1, dim2=2).add_(self._variance(row_weights))
+        if self.step_numbers is not None:
+            first, second, between = self._pairs(row_weights)
+            covariance[:, first, second] += between
+            covariance[:, second, first] += between
         return covariance
 
     def log_gradients(self, gradient: Tensor, row_weights: Tensor) -> list[Tensor]:
-        """Gradients with respect to the logs of ``of_logs``, from one with respect to the covariance (O, n, n)."""
-        own = (gradient.diagonal(dim1=1, dim2=2) / row_weights).sum(dim=1) * self.std**2
-        if self.measurement_share is None or self.step_numbers is None:
+        """Gradients with respect to the logs of ``of_logs``, from a symmetric one to the covariance (O, n, n)."""
+        own = (gradient.diagonal(dim1=1, dim2=2) * self._variance(row_weights)).sum(dim=1)
+        if self.measurement_share is None:
             return [2.0 * own]
-        share = self.measurement_share
-        between = (gradient * _neighbours(row_weights, self.step_numbers)).sum(dim=(1, 2)) * self.std**2
-        return [2.0 * own - share * between, -0.5 * share * (1.0 - share / MAX_SHARE) * between]
+        first, second, covariance = self._pairs(row_weights)
+        between = 2.0 * (gradient[:, first, second] * covariance).sum(dim=1)
+        return [2.0 * (own + between), (1.0 - self.measurement_share / MAX_SHARE) * between]
 
     def leave_one_out(self, residual: Tensor, covariance: Tensor, row_weights: Tensor) -> tuple[Tensor, Tensor]:
         """Errors of the prediction of each row of a Gaussian process from the other rows.
@@ -105,18 +106,39 @@ class RowNoise:
         if self.step_numbers is None:
             return leave_one_out(residual, covariance, self.std, row_weights)
         precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
-        noise = self.covariance(row_weights)
-        product = noise @ precision
+        product = self._times(precision, row_weights)
         own, share = (matrix.diagonal(dim1=1, dim2=2) for matrix in (precision, product))
         solved = precision @ residual.T[:, :, None]
-        error = (noise @ solved + ((1.0 - share) / own)[:, :, None] * solved)[:, :, 0]
-        given_rows = (noise - product @ noise).diagonal(dim1=1, dim2=2)
+        error = (self._times(solved, row_weights) + ((1.0 - share) / own)[:, :, None] * solved)[:, :, 0]
+        # The diagonal of N - N P N.
+        given_rows = self._variance(row_weights) - self._times(product.mT, row_weights).diagonal(dim1=1, dim2=2)
         function_variance = given_rows + (1.0 - share) ** 2 / own
         # The noise of the row is correlated with that of the neighbours, from which the function is predicted.
         prediction_and_noise = (given_rows - (1.0 - share) * share / own) * row_weights.sqrt()
         variance = function_variance + (self.std**2)[:, None] - 2.0 * prediction_and_noise
         variance = variance.clamp_min(1e-12).T
         return error.T / variance.sqrt(), variance
+
+    def _variance(self, row_weights: Tensor) -> Tensor:
+        """Variances (O, n)."""
+        return (self.std**2)[:, None] / row_weights
+
+    def _pairs(self, row_weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows of consecutive steps: the first (m,) and the second (m,) of each pair, and their covariances (O, m)."""
+        assert self.step_numbers is not None
+        assert self.measurement_share is not None
+        order = self.step_numbers.argsort()
+        consecutive = self.step_numbers[order].diff() == 1
+        first, second = order[:-1][consecutive], order[1:][consecutive]
+        factor = -0.5 * self.measurement_share * self.std**2
+        return first, second, factor[:, None] / (row_weights[first] * row_weights[second]).sqrt()
+
+    def _times(self, matrix: Tensor, row_weights: Tensor) -> Tensor:
+        """Product (O, n, m) of the covariances and matrices (O, n, m)."""
+        product = self._variance(row_weights)[:, :, None] * matrix
+        first, second, between = self._pairs(row_weights)
+        product.index_add_(1, first, between[:, :, None] * matrix[:, second])
+        return product.index_add_(1, second, between[:, :, None] * matrix[:, first])
 
 
 def prior_logs(noise_std: Tensor, step_numbers: Tensor | None) -> tuple[list[Tensor], list[float]]:
@@ -130,13 +152,6 @@ def prior_logs(noise_std: Tensor, step_numbers: Tensor | None) -> tuple[list[Ten
     if step_numbers is None:
         return [log_std], [LOG_STD_NOISE]
     return [log_std, torch.full_like(log_std, LOGIT_MEDIAN)], [LOG_STD_NOISE, LOGIT_STD]
-
-
-def _neighbours(row_weights: Tensor, step_numbers: Tensor) -> Tensor:
-    """Matrix (n, n): ``1 / sqrt(w_i w_j)`` for consecutive steps i and j of a drive, else 0."""
-    scale = row_weights.rsqrt()
-    adjacent = (step_numbers[:, None] - step_numbers).abs() == 1
-    return adjacent * scale[:, None] * scale
 
 
 def random_rows(
