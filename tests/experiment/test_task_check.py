@@ -1,6 +1,7 @@
 """The checker accepts all tasks of carlab and of the examples, and names each error of a wrong task."""
 
 import math
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from carlab.core.keep_out import Disc
 from carlab.core.quantities import CarState
 from carlab.core.task import ObstacleParkingTask, Task
 from carlab.core.task_choice import TASKS, choose_task
+from carlab.experiment.episodes import task_check
 from carlab.experiment.episodes.task_check import check_task
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "write_task.py"
@@ -173,3 +175,40 @@ def test_numbers_of_numpy_in_a_summary_and_tensors_with_gradient_are_accepted() 
 
     summary = {"success": np.float32(1.0), "laps": np.int64(3), "inside": np.True_, "best_lap_s": math.nan}
     check_task(changed(reward=reward, summary=lambda self, t, s: summary))
+
+
+def test_limit_of_a_call_does_not_change_the_timer_of_the_program() -> None:
+    handler, timer = signal.getsignal(signal.SIGALRM), signal.getitimer(signal.ITIMER_REAL)
+    check_task(Reach())
+    assert signal.getsignal(signal.SIGALRM) is handler
+    assert (signal.getitimer(signal.ITIMER_REAL)[0] > 0.0) == (timer[0] > 0.0)
+
+
+def busy(*arguments: Any) -> Any:
+    """A loop of a minute, which stands for one without an end; it handles all exceptions of a task."""
+    end_s = time.monotonic() + 60.0
+    while time.monotonic() < end_s:
+        try:
+            time.sleep(0.01)
+        except Exception:
+            continue
+
+
+@pytest.mark.parametrize(
+    ("name", "member", "what"),
+    [
+        ("reward", busy, "reward of a batch"),
+        ("success", busy, "success"),
+        ("sample_start", busy, "sample_start"),
+        ("summary", busy, "summary"),
+        ("path_m", property(busy), "path_m"),
+        ("terminated", lambda self, n: busy() if n.ndim == 1 else n[..., 0] > 9.0, "terminated of one row"),
+    ],
+)
+def test_function_that_never_returns_is_refused(
+    name: str, member: Any, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check_task(Reach())  # imports torch
+    monkeypatch.setattr(task_check, "MAX_CALL_S", 0.2)
+    with pytest.raises(ConfigError, match=f"{what} does not return within 0.2 s; look for a loop without an end"):
+        check_task(changed(**{name: member}))

@@ -17,6 +17,7 @@ from carlab.core.keep_out import Corners, KeepOut
 from carlab.core.observation import ACTION_SIZE, encode
 from carlab.core.quantities import CarState, FloatArray
 from carlab.core.task import Task
+from carlab.experiment.episodes.time_limit import TimeLimitExceededError, time_limit
 
 N_STARTS = 20
 MAX_REWARD, MAX_SPEED_MPS, MAX_POSITION_M = 100.0, 20.0, 1000.0
@@ -26,6 +27,8 @@ TORCH_TOLERANCE = 1e-3
 MAX_TICKS = 10**6
 MAX_TICK_S, TIMED_CALLS = 0.02, 5
 """Largest computation time [s] of a task in a tick, the shortest of some calls; at 30 Hz a tick has 0.033 s in all."""
+MAX_CALL_S = 20.0
+"""Time [s] after which a call counts as one that never returns; a first call may import a library or compile code."""
 OTHER_PERIOD_S = 0.1
 """A control period other than that of carlab's tasks."""
 _METRES = "positions are in metres"
@@ -64,13 +67,13 @@ def check_task(task: Task, arena_m: Corners = ()) -> None:
     _check_speed(task, before[:1], action[:1], after[:1])
     if np.abs(rewards).max() > MAX_REWARD:
         raise _error(task, f"reward is {np.abs(rewards).max():.4g} in a tick; scale it so that a good tick is about 1")
-    if np.ptp(rewards) == 0.0 and np.ptp(task.reward(before, 0.5 * action, after + 0.1)) == 0.0:
+    if np.ptp(rewards) == 0.0 and np.ptp(_call(task, "reward", task.reward, before, 0.5 * action, after + 0.1)) == 0.0:
         raise _error(task, "reward is the same for all states and actions, so there is nothing to learn")
     if costs.min() < 0.0:
         raise _error(task, f"cost is {costs.min():.4g}; it must not be below zero")
     if ends.any():
         raise _error(task, "terminated is true at a start of sample_start, so the episode would end at once")
-    if (task.cost(before) > 0.0).any():
+    if (_call(task, "cost", task.cost, before) > 0.0).any():
         raise _error(task, "cost is above zero at a start of sample_start; move the start or the keep-out shapes")
     _check_summary(task, starts)
 
@@ -80,10 +83,9 @@ def _check_speed(task: Task, before: FloatArray, action: FloatArray, after: Floa
     times_s = []
     for _ in range(TIMED_CALLS):
         began_s = time.perf_counter()
-        task.reward(before, action, after)
-        task.cost(after)
-        task.terminated(after)
-        task.success(after)
+        _call(task, "reward of one row", task.reward, before, action, after)
+        for name in ("cost", "terminated", "success"):
+            _call(task, f"{name} of one row", getattr(task, name), after)
         times_s.append(time.perf_counter() - began_s)
     if min(times_s) > MAX_TICK_S:
         raise _error(
@@ -98,8 +100,14 @@ def _error(task: Task, text: str) -> ConfigError:
 
 
 def _call(task: Task, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """The result of a function of the task. Raises ConfigError if it fails, or does not return in ``MAX_CALL_S``."""
     try:
-        return function(*arguments)
+        with time_limit(MAX_CALL_S):
+            return function(*arguments)
+    except TimeLimitExceededError as error:
+        raise _error(
+            task, f"{name} does not return within {MAX_CALL_S:g} s; look for a loop without an end, or make it faster"
+        ) from error
     except (Exception, SystemExit) as error:
         raise _error(task, f"{name} raises {type(error).__name__}: {error}".rstrip(".: ")) from error
 
