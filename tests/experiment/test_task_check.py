@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from array_api_compat import array_namespace, device
 
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import rectangle
@@ -67,6 +68,11 @@ def in_place(self: Task, features: Any, action: Any, next_features: Any) -> Any:
     return next_features[..., 0]
 
 
+def like(features: Any, values: Any) -> Any:
+    """An array of the library of the features, but on the CPU."""
+    return array_namespace(features).asarray(np.asarray(values, dtype=np.float32))
+
+
 def start(**state: Any) -> Callable[[Task, np.random.Generator], CarState]:
     return lambda self, rng: CarState(**state)
 
@@ -104,6 +110,19 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"reward": lambda self, f, a, n: n[0] * a[0]}, "reward of a batch raises ValueError"),
     ({"reward": lambda self, f, a, n: n[:, 0]}, "reward of one row raises IndexError"),
     ({"reward": lambda self, f, a, n: np.hypot(np.asarray(n)[..., 0], 1.0)}, "return a tensor"),
+    (
+        {"reward": lambda self, f, a, n: np.exp(n[..., 0])},
+        "reward of tensors on a GPU would fail, because it mixes them",
+    ),
+    (
+        {"cost": lambda self, n: np.maximum(n[..., 0] - 9.0, 0.0)},
+        "cost of tensors on a GPU would fail, because it mixes them with NumPy or with tensors on the CPU; use",
+    ),
+    (
+        {"reward": lambda self, f, a, n: -((n[..., :2] - like(n, [1.0, 0.0])) ** 2).sum(-1)},
+        "reward of tensors on a GPU would fail, because it mixes them with NumPy or with tensors on the CPU",
+    ),
+    ({"cost": lambda self, n: like(n, np.zeros(n.shape[:-1]))}, "cost of tensors on a GPU returns a value that is not"),
     ({"reward": lambda self, f, a, n: 1e5 * n[..., 0]}, "in a tick; scale it"),
     ({"reward": lambda self, f, a, n: 1.0 + 0.0 * n[..., 0]}, "nothing to learn"),
     ({"reward": lambda self, f, a, n: (n[..., 0] - 100.0) ** 0.5}, "reward is not finite"),
@@ -135,7 +154,7 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.filterwarnings("ignore:invalid value", "ignore:__array_wrap__")
 @pytest.mark.parametrize(("members", "message"), WRONG, ids=[message for _, message in WRONG])
 def test_each_error_is_named_in_one_sentence(members: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:
@@ -175,6 +194,19 @@ def test_numbers_of_numpy_in_a_summary_and_tensors_with_gradient_are_accepted() 
 
     summary = {"success": np.float32(1.0), "laps": np.int64(3), "inside": np.True_, "best_lap_s": math.nan}
     check_task(changed(reward=reward, summary=lambda self, t, s: summary))
+
+
+def test_values_on_the_device_of_the_features_and_operations_that_depend_on_values_are_accepted() -> None:
+    def reward(self: Task, features: Any, action: Any, next_features: Any) -> Any:
+        xp = array_namespace(next_features)
+        target = xp.asarray([1.0, 0.0], dtype=next_features.dtype, device=device(next_features))
+        return -((next_features[..., :2] - target) ** 2).sum(-1)
+
+    def cost(self: Task, next_features: Any) -> Any:
+        zeros = 0.0 * next_features[..., 0]
+        return zeros + 1.0 if (next_features[..., 0] > 90.0).any() else zeros
+
+    check_task(changed(reward=reward, cost=cost))
 
 
 def test_limit_of_a_call_does_not_change_the_timer_of_the_program() -> None:

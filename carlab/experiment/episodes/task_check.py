@@ -31,6 +31,8 @@ MAX_CALL_S = 20.0
 """Time [s] after which a call counts as one that never returns; a first call may import a library or compile code."""
 OTHER_PERIOD_S = 0.1
 """A control period other than that of carlab's tasks."""
+OTHER_DEVICE = ("to numpy", "the expected device meta", "on the same device")
+"""Texts of torch's errors where tensors on a device meet NumPy or tensors on the CPU."""
 _METRES = "positions are in metres"
 _ATTRIBUTES = (
     *("name", "history_length", "max_ticks", "cost_weight"),
@@ -264,7 +266,28 @@ def _check_function(task: Task, name: str, arguments: tuple[FloatArray, ...], *,
     torch_values = _values(task, f"{name} of torch tensors", in_torch.detach().numpy(), values.shape, bool_wanted)
     if not bool_wanted and not np.allclose(torch_values, values, rtol=TORCH_TOLERANCE, atol=TORCH_TOLERANCE):
         raise _error(task, f"{name} differs between NumPy and torch")
+    _check_device(task, name, tensors)
     return values
+
+
+def _check_device(task: Task, name: str, tensors: list[Any]) -> None:
+    """Check that a function of torch tensors stays on their device, which is a GPU with ``--device cuda``.
+
+    torch's device ``meta``, whose tensors have no values, represents the GPU. There, tensors of the CPU and conversions
+    to NumPy fail as on a GPU. Operations that depend on values fail too, although a GPU has them; they are not checked.
+    """
+    import torch
+
+    remedy = "use the library and the device of the features (array_namespace(x), device=x.device)"
+    try:
+        result = _call(task, name, getattr(task, name), *(tensor.to("meta") for tensor in tensors))
+    except ConfigError as error:
+        if any(text in str(error) for text in OTHER_DEVICE):
+            raise _error(task, f"{name} of tensors on a GPU would fail, because it mixes them with NumPy or with "
+                               f"tensors on the CPU; {remedy}") from error  # fmt: skip
+        return
+    if not isinstance(result, torch.Tensor) or result.device.type != "meta":
+        raise _error(task, f"{name} of tensors on a GPU returns a value that is not on the GPU; {remedy}")
 
 
 def _values(task: Task, name: str, result: Any, shape: tuple[int, ...], bool_wanted: bool) -> FloatArray:
