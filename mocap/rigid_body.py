@@ -33,6 +33,8 @@ RECENT_FRAMES = 60
 that was carried can be armed soon after it stands level again, and not while the network is congested."""
 RECENT_SHARE = 0.2
 """Share of the recent frames that may be tilted, or invalid, by single errors of tracking [1]."""
+EXTREME_FRAMES = 5
+"""Number of newest poses whose median counts for the extremes of the position: up to two outliers in a row do not."""
 BODY_REMOVED = "the server no longer has the body; define it again in Motive under the same name."
 
 
@@ -62,6 +64,7 @@ class RigidBodyPoseSource(Resource):
         self._recent_tilted: deque[bool] = deque(maxlen=RECENT_FRAMES)
         self._recent_unusable: deque[bool] = deque(maxlen=RECENT_FRAMES)
         self._recent_latency_ms: deque[float] = deque(maxlen=RECENT_FRAMES)
+        self._recent_positions_m: deque[tuple[float, float, float]] = deque(maxlen=EXTREME_FRAMES)
         self._low_m = [math.inf] * 3
         self._high_m = [-math.inf] * 3
 
@@ -258,9 +261,8 @@ class RigidBodyPoseSource(Resource):
         else:
             self._tracked += 1
             (x_m, y_m, z_m), yaw_rad = pose
-            for axis, value in enumerate((x_m, y_m, z_m)):
-                self._low_m[axis] = min(self._low_m[axis], value)
-                self._high_m[axis] = max(self._high_m[axis], value)
+            self._recent_positions_m.append((x_m, y_m, z_m))
+            self._widen_extremes()
             return PoseSample(sequence, capture_s, received_s, x_m, y_m, yaw_rad, z_m)
         if self._samples:
             last = self._samples[-1]
@@ -271,6 +273,14 @@ class RigidBodyPoseSource(Resource):
         else:
             return None
         return PoseSample(sequence, capture_s, received_s, *held, tracked=False)
+
+    def _widen_extremes(self) -> None:
+        """Take the median of the newest positions into the extremes."""
+        if len(self._recent_positions_m) < EXTREME_FRAMES:
+            return
+        for axis, values in enumerate(zip(*self._recent_positions_m, strict=True)):
+            self._low_m[axis] = min(self._low_m[axis], median(values))
+            self._high_m[axis] = max(self._high_m[axis], median(values))
 
     def _pose(self, body: RigidBody) -> tuple[tuple[float, float, float], float] | None:
         """Pose of base_link; None for invalid numbers."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +13,7 @@ from carlab.core.quantities import PoseSample
 from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
+from mocap.emulators.scene import RigidBodySample
 from mocap.natnet.models import BitstreamVersion, MessageId, ServerMode
 from mocap.natnet_client import NatNetClient
 from mocap.rigid_body import RigidBodyPoseSource
@@ -102,3 +105,23 @@ def test_missing_clock_echo_is_a_problem_of_a_server_with_a_clock_only(
     monkeypatch.setattr("mocap.emulators.natnet_server.CLOCK_HZ", 0)
     with RigidBodyPoseSource(configure(serve(kind=ServerWithoutEcho), timeout_s=0.5)) as source:
         assert source.problems() == ()
+
+
+@pytest.mark.parametrize("outlier_m", [(1.0, -2.0, 2.0), (1.0, 8.0, 0.1)])
+def test_outliers_neither_cause_nor_hide_the_message_about_the_vertical_axis(
+    serve: Serve, configure: Configure, outlier_m: tuple[float, float, float]
+) -> None:
+    numbers = itertools.count()
+    is_lifted = threading.Event()
+
+    def poses(t_s: float) -> list[RigidBodySample]:
+        position_m = (1.0, -2.0, 2.0) if is_lifted.is_set() else (1.0, -2.0, 0.1)
+        return [RigidBodySample(t_s, outlier_m if next(numbers) in (50, 51, 70) else position_m)]
+
+    with RigidBodyPoseSource(configure(serve(poses))) as source:
+        until(lambda: source.statistics()["tracked"] >= 100.0)
+        received = [(sample.x_m, sample.y_m, sample.z_m) for sample in source.since(-1)]
+        assert pytest.approx(outlier_m) in received
+        assert source.problems() == ()
+        is_lifted.set()
+        until(lambda: "has moved vertically by more than 0.3 m and hardly in y" in "".join(source.problems()))
