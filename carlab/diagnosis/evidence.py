@@ -10,7 +10,15 @@ import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.explained import explained_shares
-from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
+from carlab.diagnosis.findings import (
+    SLOW_POSES,
+    DataFault,
+    EffectFinding,
+    ErrorLocation,
+    Estimate,
+    Evidence,
+    Verdict,
+)
 from carlab.diagnosis.identification.block_jackknife import clustered_gain, interval_quantile
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.fit_parameters import FitParameter, stated_values
@@ -237,6 +245,8 @@ def verdict_of(scored: ScoredSearch, has_unnamed: bool, data_faults: Sequence[Da
     problem, score = scored.problem, scored.scores()
     best = min(score["refit"], score["nominal"])  # with few recordings a refit may be worse than the car file
     min_score = EVIDENCE.unexplained_score_min if has_unnamed else EVIDENCE.unexplained_score_min_without_term
+    if any(f.id == SLOW_POSES for f in data_faults):
+        min_score = max(min_score, EVIDENCE.unexplained_score_min_of_slow_poses)
     if best > min_score:
         return "unexplained"
     nominal_loss = problem.fitter(scored.found.scale).loss(problem.nominal)

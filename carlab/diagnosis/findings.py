@@ -21,6 +21,8 @@ from carlab.diagnosis.measured import RejectedCurves as RejectedCurves
 from carlab.diagnosis.settings import EVIDENCE
 
 SCHEMA = "carlab.diagnosis/1"
+SLOW_POSES = "slow_poses"
+"""Id of the fault of velocities that are estimated from poses that are too far apart."""
 Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from carlab.diagnosis.findings import Diagnosis, EffectFinding, final_model_name
+from carlab.diagnosis.findings import SLOW_POSES, Diagnosis, EffectFinding, final_model_name
 from carlab.diagnosis.report.numbers import listed, number, with_unit
 from carlab.diagnosis.report.residual import is_above_noise
 from carlab.diagnosis.settings import IDENTIFICATION, REPORT
@@ -10,7 +10,7 @@ from sim_backends.effects import EFFECTS
 from sim_backends.measurement import COMMAND_DELAY, LATENCY
 from sim_backends.registry import REGISTRY
 
-LIMITED, FRAME_RATE, SLOW_POSES = "limited_commands", "wrong_frame_rate", "slow_poses"
+LIMITED, FRAME_RATE = "limited_commands", "wrong_frame_rate"
 """Ids of faults."""
 
 

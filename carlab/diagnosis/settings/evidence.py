@@ -44,6 +44,9 @@ class EvidenceSettings:
     """Refit score (noise floors) above which unnamed terms count as missing physics."""
     unexplained_score_min_without_term: float = 1.8
     """The same if no unnamed term is significant."""
+    unexplained_score_min_of_slow_poses: float = 1.8
+    """The same if velocities are estimated from poses that are too far apart (fault ``slow_poses``): the simulator of
+    the car itself has up to 1.8 noise floors then."""
     confidence_half: float = 8.0
     """Square root of chi2 at which half of the effects are correct, by logistic regression on development cases."""
     confidence_slope: float = 5.0
