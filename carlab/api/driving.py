@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from carlab.api.arguments import above_zero, at_least, valid_seed
+from carlab.api.arguments import above_zero, at_least, at_most, valid_seed
 from carlab.api.drive_run import DriveRun, run_results
 from carlab.api.recordings import Recording, load
 from carlab.api.runs import (
@@ -30,6 +30,7 @@ from carlab.core.manoeuvres import MANOEUVRES
 from carlab.core.policy import Policy
 from carlab.core.quantities import CarState, Reality
 from carlab.core.task import ParkingTask, RecordedTask, Task
+from carlab.core.ticks import MAX_TICKS
 from carlab.experiment.episodes.hooks import RunHooks
 from carlab.experiment.episodes.interrupts import Interrupts, check_main_thread
 from carlab.experiment.episodes.result import EpisodeResult
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from sim_backends.car_parameters import SimulatorConfig
 
 KEY_THROTTLE = 0.4
-TELEOP_MAX_TICKS = 10**6
 EXCITATION, EXCITATION_S = "excitation", 60.0
 """Name of the policy, and duration [s] of an episode with it."""
 
@@ -72,7 +72,7 @@ def drive(
             oval.
         episodes: number of episodes.
         ticks: control periods (ticks) per episode; by default the task's number (parking: 100 at 30 Hz), a whole
-            manoeuvre, a minute of ``excitation``, or for ``keyboard`` and ``gamepad`` no limit.
+            manoeuvre, a minute of ``excitation``, or for ``keyboard`` and ``gamepad`` the most, a million.
         seed: seed of start poses, sensor noise and the commands of ``excitation``.
         max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
         place: start each episode at the task's start pose; otherwise at the car's current pose.
@@ -210,7 +210,7 @@ def _drive(
     with contextlib.ExitStack() as signals, contextlib.ExitStack() as stack:
         if teleop is not None:
             hooks = _in_real_time(hooks, choice.car.clock)
-            max_ticks = options["max_ticks"] or TELEOP_MAX_TICKS
+            max_ticks = options["max_ticks"] or MAX_TICKS
             options = {**options, "max_ticks": max_ticks, "stop_reason": teleop.stop_reason}
             stack.enter_context(teleop)
         stack.enter_context(choice.car)
@@ -241,6 +241,7 @@ def _check(
 ) -> None:
     check_main_thread()
     at_least(1, episodes=episodes, ticks=ticks)
+    at_most(MAX_TICKS, ticks=ticks)
     valid_seed(seed=seed)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():
         if len(Path(policy).parts) > 1 and not Path(policy).exists():

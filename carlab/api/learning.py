@@ -36,6 +36,7 @@ from carlab.api.tasks import check_trainable, given_task, load_checked
 from carlab.core.errors import ConfigError
 from carlab.core.outcome import EndReason
 from carlab.core.task import Task
+from carlab.core.ticks import MAX_TICKS
 from carlab.core.version import VERSION
 from carlab.experiment.campaign.hooks import LearnHooks
 from carlab.experiment.cluster.settings import LinkSettings
@@ -133,7 +134,7 @@ def learn(
         task: as for ``carlab.drive``; by default that of the resumed run, else ``parking``.
         track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
-        ticks: control periods (ticks) per episode, more than ``history``; by default the task's number.
+        ticks: control periods (ticks) per episode, from ``history`` + 1 to a million; by default the task's number.
         prior: the prior simulator: ``nominal`` (the default), ``kinematic``, or a car file such as a diagnosed model.
             ``auto`` starts with the nominal one; between episodes, effects and parameters that the recordings support
             are added to it, and those that the recordings contradict are removed.
@@ -281,6 +282,7 @@ def _check(request: LearnRequest) -> None:
     at_least(0, history=request.history)
     valid_seed(seed=request.seed)
     at_most(LARGEST_GIVEN_HISTORY, history=request.history)
+    at_most(MAX_TICKS, ticks=request.ticks)
     above_zero(ray_wait=request.ray_wait)
     if not request.ray:
         available(request.device or "cpu")

@@ -114,6 +114,8 @@ def test_replay_of_recorded_actions_reaches_the_same_position(tmp_path: Path) ->
     [
         (lambda: carlab.drive("sim", episodes=1.5), "--episodes 1.5: give a whole number"),
         (lambda: carlab.drive("sim", ticks=2.5), "--ticks 2.5: give a whole number"),
+        (lambda: carlab.drive("sim", ticks=10**9), "--ticks 1000000000: give at most 1000000."),
+        (lambda: carlab.learn("sim", ticks=10**6 + 1), "--ticks 1000001: give at most 1000000."),
         (lambda: carlab.drive("sim", seed="x"), "--seed 'x': give a whole number"),
         (lambda: carlab.drive("sim", policy=5), "--policy 5: give a name"),
         (lambda: carlab.drive("sim", viewer=5), "--viewer 5: give the address"),

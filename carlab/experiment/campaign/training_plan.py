@@ -11,6 +11,7 @@ from carlab.core.method_names import current_method
 from carlab.core.seeds import MAX_SEED
 from carlab.core.task import Task
 from carlab.core.task_choice import PARKING, TaskChoice
+from carlab.core.ticks import MAX_TICKS
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
 from learning.world.car_fit import Method, Particles
@@ -22,7 +23,7 @@ PLAN_VERSION = 2
 EARLIER_NAMES = {"sim-fsvgd": "gp-sim-posterior", "fsvgd": "gp-posterior", "fsvgd-authors": "fsvgd"}
 """Methods of plans of version 1 by their current names."""
 MIN_VALUES = {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}
-MAX_VALUES = {"history": LARGEST_GIVEN_HISTORY, "seed": MAX_SEED}
+MAX_VALUES = {"history": LARGEST_GIVEN_HISTORY, "seed": MAX_SEED, "ticks": MAX_TICKS}
 """Ranges of the integers of a plan."""
 
 

@@ -17,6 +17,7 @@ from carlab.core.keep_out import Corners, KeepOut
 from carlab.core.observation import ACTION_SIZE, encode
 from carlab.core.quantities import CarState, FloatArray
 from carlab.core.task import Task
+from carlab.core.ticks import MAX_TICKS
 from carlab.experiment.episodes.time_limit import TimeLimitExceededError, time_limit
 
 N_STARTS = 20
@@ -24,7 +25,6 @@ MAX_REWARD, MAX_SPEED_MPS, MAX_POSITION_M = 100.0, 20.0, 1000.0
 """Largest plausible reward of a tick, speed and position; larger ones have the wrong unit."""
 TORCH_TOLERANCE = 1e-3
 """Relative difference of float32 from float64."""
-MAX_TICKS = 10**6
 MAX_TICK_S, TIMED_CALLS = 0.02, 5
 """Largest computation time [s] of a task in a tick, the shortest of some calls; at 30 Hz a tick has 0.033 s in all."""
 MAX_CALL_S = 20.0
