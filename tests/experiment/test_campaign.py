@@ -132,6 +132,16 @@ def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, 
             saved_plan(invalid_run.path)
 
 
+@pytest.mark.parametrize("history", [HISTORY - 1, HISTORY + 2])
+def test_history_other_than_that_of_the_policy_is_refused(interrupted: InterruptedRun, history: int) -> None:
+    run = RunDirectory(shutil.copytree(interrupted.run.path, interrupted.run.path.with_name(f"history_{history}")))
+    content = json.loads((run.path / "campaign.json").read_text())
+    content["plan"]["history"] = history
+    (run.path / "campaign.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match=f"observes {HISTORY} past commands and .* states a history of {history};"):
+        resumed_campaign(run, choose_car("sim"))
+
+
 def test_learning_curve_has_the_figures_of_the_recordings(interrupted: InterruptedRun) -> None:
     rows = json.loads((interrupted.run.path / "learn.json").read_text())["episodes"]
     assert [r["episode"] for r in rows] == [1, 2]

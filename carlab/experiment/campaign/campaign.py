@@ -23,6 +23,7 @@ from carlab.cars import CarChoice
 from carlab.core.documents import EpisodeEnded
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
+from carlab.core.observation import ACTION_SIZE, STATE_FEATURES
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
@@ -45,7 +46,7 @@ from carlab.experiment.episodes.result import EpisodeResult
 from carlab.experiment.episodes.session import Session
 from carlab.recording.mcap.source import has_ticks, read_documents
 from carlab.recording.run_folder import RunDirectory
-from learning.policy.sac_agent import SacAgent, SacSettings
+from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
 
 T = TypeVar("T", int, bool)
@@ -331,7 +332,11 @@ def saved_plan(folder: Path) -> TrainingPlan:
 
 
 def resumed_campaign(run: RunDirectory, choice: CarChoice, device: str | None = None) -> Campaign:
-    """Resume a run with its saved settings, optionally on another device. Raises DataError if it is not a campaign."""
+    """Resume a run with its saved settings, optionally on another device.
+
+    Raises:
+        DataError: it is not a campaign, or its settings do not fit its newest policy.
+    """
     path = run.path / CAMPAIGN_FILE
     try:
         content = read_json(path)
@@ -340,7 +345,7 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, device: str | None = 
         SimulatorConfig.from_tables(toml_tables(plan.prior_toml))
         tables = content.get("questioned")
         checked_simulator = None if tables is None else SimulatorConfig.from_tables(tables)
-        return Campaign(
+        campaign = Campaign(
             choice, plan, _checked_value(content, "episodes", int), run, LearnHooks(),
             None if content["ticks"] is None else _checked_value(content, "ticks", int),
             _checked_value(content, "place", bool), _checked_value(content, "rerun", bool),
@@ -351,6 +356,24 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, device: str | None = 
             f"{run.path} cannot be resumed ({CAMPAIGN_FILE}: {error}); name the folder of a run of carlab learn, or "
             "start a new run."
         ) from error
+    _check_history(campaign)
+    return campaign
+
+
+def _check_history(campaign: Campaign) -> None:
+    """Raise DataError if the newest policy observes another number of past commands than the settings state."""
+    numbers = [int(p.name) for p in campaign.run.models.glob("*") if p.name.isdecimal() and (p / AGENT_FILE).is_file()]
+    if not numbers:
+        return
+    folder, history = model_folder(campaign.run.models, max(numbers)), campaign.current_plan(max(numbers) - 1).history
+    observed = (
+        SacAgent.load(folder, SacSettings(), campaign.plan.seed).observation_size - STATE_FEATURES
+    ) // ACTION_SIZE
+    if observed != history:
+        raise DataError(
+            f"{campaign.run.path} cannot be resumed, because the policy in {folder} observes {observed} past commands "
+            f"and {CAMPAIGN_FILE} states a history of {history}; restore the file, or start a new run."
+        )
 
 
 def _checked_value(content: Mapping[str, Any], name: str, kind: type[T]) -> T:
