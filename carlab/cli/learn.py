@@ -18,14 +18,16 @@ from carlab.api.learning import LearnRun, learn
 from carlab.api.runs import figure_names
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
+from carlab.cli.neutral_warnings import neutral_warning
 from carlab.cli.options import ARGUMENT_DEFAULT, CarOptions, TaskOptions, arguments_of, options_of
 from carlab.cli.runs import common_hooks, figure_text, heading
-from carlab.core.documents import Tick
+from carlab.core.documents import Document, SafetyEvent, Tick
 from carlab.experiment.campaign.hooks import LearnHooks
 
 if TYPE_CHECKING:
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.quick_check import EpisodeCheck
+    from carlab.experiment.episodes.result import EpisodeResult
 
 STEPS_PERIOD_S = 600.0
 
@@ -112,6 +114,7 @@ class Learn:
 
     def _hooks(self, bar: Progress) -> LearnHooks:
         rows: dict[str, TaskID] = {}
+        events: list[SafetyEvent] = []
 
         def show_progress(activity: str, done: int, total: int) -> None:
             if activity not in rows:
@@ -122,11 +125,20 @@ class Learn:
             bar.update(rows[activity], completed=done, total=total)
 
         def on_episode(number: int, ticks: int) -> None:
+            events.clear()
             show_progress(f"episode {number}", 0, ticks)
 
         def on_tick(tick: Tick) -> None:
             (task,) = rows.values()
             bar.update(task, completed=tick.step + 1)
+
+        def on_document(document: Document) -> None:
+            if isinstance(document, SafetyEvent):
+                events.append(document)
+
+        def on_result(result: EpisodeResult) -> None:
+            if not result.reason.is_safety_stop and (warning := neutral_warning(result.data, events)):
+                bar.console.print(f"Warning: Episode {result.episode}: {warning}", soft_wrap=True)
 
         def show(sentence: str) -> None:
             bar.console.print(f"  {sentence}", soft_wrap=True)
@@ -143,6 +155,8 @@ class Learn:
             **common_hooks(bar),
             on_episode=on_episode,
             on_tick=on_tick,
+            on_document=on_document,
+            on_result=on_result,
             on_training=show_progress,
             on_learned=on_learned,
             on_figures=functools.partial(_print_figures, bar),
