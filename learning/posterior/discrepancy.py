@@ -192,15 +192,9 @@ def fit_discrepancy(
         The covariance and the noise.
     """
     residual, inputs = residual.double(), inputs.double()
-    start = DiscrepancyCovariance.at_prior_median(inputs.shape[1], prior_std, multiplier_share)
+    medians = _prior_medians(DiscrepancyCovariance.at_prior_median(inputs.shape[1], prior_std, multiplier_share))
     inputs = inputs if simulated_mean is None else torch.cat([inputs, simulated_mean.double()], dim=1)
-    parts = (
-        start.scales, start.lengthscales, start.slopes, start.offsets, start.multiplier_stds,
-        start.multiplier_lengthscales,
-    )  # fmt: skip
-    factors = [torch.zeros_like(start.scales), torch.zeros_like(start.lengthscales[0])]
-    of_noise, noise_stds = prior_logs(noise_std, step_numbers)
-    medians = [*(v.log() for v in parts), *factors, *of_noise]
+    noise_medians, noise_stds = prior_logs(noise_std, step_numbers)
 
     def evaluate(logs: list[Tensor], rows: Tensor) -> Evaluated:
         covariance, part_gradients = _covariance_of(logs).with_pullback(inputs[rows])
@@ -217,7 +211,8 @@ def fit_discrepancy(
 
         return covariance, pullback
 
-    logs = _maximise_posterior(medians, (*LOG_STDS, *noise_stds), residual, evaluate, seed, step_numbers)
+    widths = (*LOG_STDS, *noise_stds)
+    logs = _maximise_posterior([*medians, *noise_medians], widths, residual, evaluate, seed, step_numbers)
     return _covariance_of(logs), RowNoise.of_logs(logs[8:], step_numbers)
 
 
@@ -288,6 +283,16 @@ def _maximise_posterior(
 def _of_rows(covariance: Tensor, rows: Tensor) -> Tensor:
     """Covariances (O, m, m) of the rows with indices (m,), from those of all (O, n, n)."""
     return covariance if len(rows) == covariance.shape[1] else covariance[:, rows][:, :, rows]
+
+
+def _prior_medians(start: DiscrepancyCovariance) -> list[Tensor]:
+    """Logarithms of the six parts of a covariance, and zeros for the factors by output and by input."""
+    parts = (
+        start.scales, start.lengthscales, start.slopes, start.offsets, start.multiplier_stds,
+        start.multiplier_lengthscales,
+    )  # fmt: skip
+    factors = torch.zeros_like(start.scales), torch.zeros_like(start.lengthscales[0])
+    return [*(part.log() for part in parts), *factors]
 
 
 def _covariance_of(logs: list[Tensor]) -> DiscrepancyCovariance:

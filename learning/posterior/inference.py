@@ -30,8 +30,8 @@ from learning.posterior.discrepancy import (
 from learning.posterior.function_posterior import FunctionPosterior, simulate
 from learning.posterior.parameter_posterior import posterior_parameters
 from learning.posterior.row_noise import FIT_BLOCK_ROWS, RowNoise, prior_logs, random_rows
-from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, DomainModel, draw_parameters
-from learning.priors.function_prior import moments
+from learning.posterior.simulator_residual import SimulatorResidual, plausible_draws, simulator_residual
+from learning.priors.domain_models import DomainModel, draw_parameters
 
 PARAMETER_DRAWS = 128
 """Draws of the parameters given data."""
@@ -160,23 +160,6 @@ class _Problem:
         return max(len(self.inputs) / ROWS_PER_DOF, MIN_DOF) if fitted else math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class _Residual:
-    """Residual of the simulator's mean.
-
-    Attributes:
-        mean: normalised outputs less the mean of the draws (n, O).
-        parameter_covariance: covariance of the draws (O, n, n); None without a simulator.
-        inputs: of the discrepancy (n, D + O), or (n, D) without a simulator.
-        posterior: normalised outputs less each draw (P, n, O), if the draws are given the rows.
-    """
-
-    mean: Tensor
-    parameter_covariance: Tensor | None
-    inputs: Tensor
-    posterior: Tensor | None = None
-
-
 @dataclass(slots=True)
 class _Estimate:
     """Current estimate of all quantities in the alternation.
@@ -197,7 +180,7 @@ class _Estimate:
 
     normaliser: Normaliser
     parameters: Tensor | None
-    residual: _Residual
+    residual: SimulatorResidual
     discrepancy: DiscrepancyCovariance | None
     noise: RowNoise
     noise_prior_std: Tensor
@@ -287,7 +270,10 @@ def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, genera
         discrepancy = DiscrepancyCovariance.at_prior_median(
             problem.inputs.shape[1], problem.discrepancy_std, problem.multiplier_share
         )
-    residual = _residual(problem, parameters, problem.normaliser, given_rows=known_parameters is not None)
+    given_rows = known_parameters is not None
+    residual = simulator_residual(
+        problem.model, problem.inputs, problem.outputs, parameters, problem.normaliser, given_rows=given_rows
+    )
     estimate = _Estimate(
         problem.normaliser, parameters, residual, discrepancy, noise, noise.std, ones,
         torch.eye(len(noise.std), dtype=torch.float64, device=problem.inputs.device), problem.max_dof,
@@ -304,7 +290,7 @@ def _prior_parameters(problem: _Problem, model: DomainModel, generator: torch.Ge
         return draw_parameters(model, PRIOR_DRAWS if model.size else 1, generator).to(problem.inputs)
     drawn = draw_parameters(model, PARAMETER_DRAWS, generator).to(problem.inputs)
     domain = model.inputs(DOMAIN_ROWS, torch.Generator().manual_seed(problem.seed)).to(problem.inputs)
-    return drawn[_plausible(simulate(model, domain, drawn, problem.normaliser))]
+    return drawn[plausible_draws(simulate(model, domain, drawn, problem.normaliser))]
 
 
 def _fit_covariance(problem: _Problem, estimate: _Estimate) -> None:
@@ -330,7 +316,9 @@ def _infer_parameters(problem: _Problem, estimate: _Estimate, rows: Tensor, gene
         problem.model, problem.inputs[rows], problem.outputs[rows], cholesky, estimate.normaliser, PARAMETER_DRAWS,
         generator,
     )  # fmt: skip
-    estimate.residual = _residual(problem, estimate.parameters, estimate.normaliser)
+    estimate.residual = simulator_residual(
+        problem.model, problem.inputs, problem.outputs, estimate.parameters, estimate.normaliser
+    )
 
 
 def _fit_student_noise(problem: _Problem, estimate: _Estimate) -> tuple[Tensor, Tensor]:
@@ -356,7 +344,9 @@ def _decorrelate_outputs(problem: _Problem, estimate: _Estimate, width: Tensor, 
     estimate.noise_prior_std = torch.maximum(width * estimate.noise.std, MIN_NOISE_SHARE * problem.noise_std)
     error_std = width * variance.median(dim=0).values.sqrt()
     estimate.normaliser = estimate.normaliser.decorrelated(decorrelation_of(estimate.correlation, error_std))
-    estimate.residual = _residual(problem, estimate.parameters, estimate.normaliser)
+    estimate.residual = simulator_residual(
+        problem.model, problem.inputs, problem.outputs, estimate.parameters, estimate.normaliser
+    )
 
 
 def _condition(problem: _Problem, estimate: _Estimate) -> FunctionPosterior:
@@ -367,7 +357,7 @@ def _condition(problem: _Problem, estimate: _Estimate) -> FunctionPosterior:
     residuals = targets[None]
     if model is not None and parameters is not None:
         simulated = simulate(model, problem.inputs, parameters, normaliser)
-        plausible = _plausible(simulated)
+        plausible = plausible_draws(simulated)
         parameters, residuals = parameters[plausible], targets - simulated[plausible]
     whitened = torch.linalg.solve_triangular(cholesky, residuals.permute(2, 1, 0), upper=False)
     noise_std = torch.maximum(estimate.scale * estimate.noise.std, MIN_NOISE_SHARE * problem.noise_std).float()
@@ -375,32 +365,6 @@ def _condition(problem: _Problem, estimate: _Estimate) -> FunctionPosterior:
         normaliser, noise_std, estimate.dof, estimate.correlation.float(), model, parameters, estimate.discrepancy,
         estimate.residual.inputs, cholesky, whitened,
     )  # fmt: skip
-
-
-def _residual(
-    problem: _Problem, parameters: Tensor | None, normaliser: Normaliser, *, given_rows: bool = True
-) -> _Residual:
-    inputs = normaliser.inputs(problem.inputs).double()
-    targets = normaliser.outputs(problem.outputs).double()
-    if problem.model is None or parameters is None:
-        return _Residual(targets, None, inputs)
-    simulated = simulate(problem.model, problem.inputs, parameters, normaliser)
-    simulated = simulated[_plausible(simulated)]
-    mean, covariance = moments(simulated)
-    given = targets - simulated if given_rows else None
-    return _Residual(targets - mean, covariance, torch.cat([inputs, mean], dim=1), given)
-
-
-def _plausible(simulated: Tensor) -> Tensor:
-    """Mask (P,) of the draws whose outputs (P, N, O) are finite and of plausible size.
-
-    Raises:
-        DataError: no draw is plausible.
-    """
-    plausible = (simulated.abs() < MAX_PLAUSIBLE_OUTPUT).flatten(1).all(dim=1)
-    if not bool(plausible.any()):
-        raise DataError(NO_FINITE_OUTPUT)
-    return plausible
 
 
 def _covariance(

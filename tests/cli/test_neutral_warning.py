@@ -69,14 +69,6 @@ def test_learning_run_warns_after_each_episode_with_the_events_of_this_episode()
     ]
 
 
-def test_learning_car_that_slow_motion_capture_stops_gets_a_warning(carlab: Carlab, tmp_path: Path) -> None:
-    path = tmp_path / "car.toml"
-    path.write_text("[mocap]\nrate = 4.0\n", encoding="utf-8")
-    options = ("--episodes", 1, "--ticks", 40, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun")
-    code, text = carlab("learn", "--car", path, *options, "--out", tmp_path / "runs")
-    assert code == 0
-    assert "Warning: Episode 1: Neutral replaced" in text
-
 
 def test_car_that_slow_motion_capture_stops_gets_a_warning(carlab: Carlab, tmp_path: Path) -> None:
     path = tmp_path / "car.toml"
