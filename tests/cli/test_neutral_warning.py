@@ -69,7 +69,6 @@ def test_learning_run_warns_after_each_episode_with_the_events_of_this_episode()
     ]
 
 
-
 def test_car_that_slow_motion_capture_stops_gets_a_warning(carlab: Carlab, tmp_path: Path) -> None:
     path = tmp_path / "car.toml"
     path.write_text("[mocap]\nrate = 4.0\n", encoding="utf-8")
