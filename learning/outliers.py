@@ -41,7 +41,7 @@ def initial_row_weights(weights: Tensor, standardised_errors: Callable[[Tensor],
     The weights precede the fit of the covariance, because a fitted covariance would follow gross outliers.
 
     Args:
-        weights: initial weights (n,), all 1.
+        weights: equal initial weights (n,), all 1.
         standardised_errors: leave-one-out errors of a simulator's residual (n, O) for given weights.
     """
     for _ in range(INITIAL_WEIGHT_ITERATIONS):

@@ -72,7 +72,7 @@ def drive(
             oval.
         episodes: number of episodes.
         ticks: control periods (ticks) per episode; by default the task's number (parking: 100 at 30 Hz), a whole
-            manoeuvre, a minute of ``excitation``, or for ``keyboard`` and ``gamepad`` the most, a million.
+            manoeuvre, a minute of ``excitation``, or a million (the maximum) for ``keyboard`` and ``gamepad``.
         seed: seed of start poses, sensor noise and the commands of ``excitation``.
         max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
         place: start each episode at the task's start pose; otherwise at the car's current pose.

@@ -22,7 +22,7 @@ from torch import Tensor
 from learning.outliers import leave_one_out
 
 MAX_SHARE = 0.98
-"""Upper bound of the share of measurement noise; at 1 the covariance of a long drive is nearly singular."""
+"""Upper bound of the share of measurement noise; at 1 the covariance of a long drive is ill-conditioned."""
 LOG_STD_NOISE = 0.5
 """Prior standard deviation of the logarithm of the noise's standard deviation."""
 LOGIT_MEDIAN, LOGIT_STD = 0.0, 3.0
@@ -50,10 +50,7 @@ class RowNoise:
 
     @classmethod
     def of_logs(cls, logs: Sequence[Tensor], step_numbers: Tensor | None) -> RowNoise:
-        """From logarithms of the standard deviations (O,) and, with step numbers, logits of the shares of the maximum.
-
-        The maximum of a share is ``MAX_SHARE``.
-        """
+        """From logarithms of ``std`` (O,) and, with step numbers, logits of ``measurement_share / MAX_SHARE`` (O,)."""
         if step_numbers is None:
             return cls(logs[0].exp())
         return cls(logs[0].exp(), MAX_SHARE * torch.sigmoid(logs[1]), step_numbers)

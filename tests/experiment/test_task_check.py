@@ -217,7 +217,7 @@ def test_limit_of_a_call_does_not_change_the_timer_of_the_program() -> None:
 
 
 def busy(*arguments: Any) -> Any:
-    """A loop of a minute, which stands for one without an end; it handles all exceptions of a task."""
+    """A loop of a minute in place of an endless one; it handles each ``Exception``."""
     end_s = time.monotonic() + 60.0
     while time.monotonic() < end_s:
         try:
@@ -237,7 +237,7 @@ def busy(*arguments: Any) -> Any:
         ("terminated", lambda self, n: busy() if n.ndim == 1 else n[..., 0] > 9.0, "terminated of one row"),
     ],
 )
-def test_function_that_never_returns_is_refused(
+def test_function_that_does_not_return_is_refused(
     name: str, member: Any, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     check_task(Reach())  # imports torch

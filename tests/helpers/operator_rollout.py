@@ -29,7 +29,7 @@ def operator_rollout(
     every: int = 1,
     returned: IntArray | None = None,
 ) -> FloatRow:
-    """``array_rollout`` by torch's operators, for ``report_evaluations``; all rows before the first tick are used."""
+    """``array_rollout`` by torch's operators; all rows before the first tick are used."""
     shown = slice(None) if returned is None else returned
     config = SimulatorConfig(
         kind=kind, effects={name: {} for name in effects}, control_period_s=float(numbers["timing.control_period"])

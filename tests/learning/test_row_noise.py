@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 import torch
 
+from carlab.core.episode_data import EpisodeData
 from learning.networks.normaliser import Normaliser
 from learning.posterior.inference import infer
 from learning.posterior.row_noise import BLOCK_ROWS, MAX_SHARE, RowNoise, random_rows
+from learning.priors.simulator_model import CarModel
+from learning.transitions import transitions_of
+from learning.world import car_fit
+from sim_backends.car_parameters import SimulatorConfig
 
 STEPS = torch.tensor([3, 4, 5, 6, 9, 10, 20])
 """Steps of drives with four, two and one consecutive rows."""
@@ -134,3 +139,33 @@ def test_noise_of_the_inputs_is_not_taken_for_a_slope():
     independent = [slope(None, seed) for seed in range(3)]
     assert np.mean(independent) < -0.75
     assert np.mean(with_steps) == pytest.approx(-0.3, abs=0.15)
+
+
+class InferenceReached(Exception):
+    """The fit of a car has called the inference."""
+
+
+def test_fit_of_a_car_states_which_rows_are_consecutive_steps(monkeypatch):
+    """Where step numbers differ by 1, the velocities after the first row are those before the second."""
+    given = {}
+
+    def infer_rows(model, inputs, outputs, *arguments, step_numbers, **options):
+        given.update(inputs=inputs, outputs=outputs, step_numbers=step_numbers)
+        raise InferenceReached
+
+    monkeypatch.setattr(car_fit, "infer", infer_rows)
+    rng = np.random.default_rng(4)
+    drives = [
+        EpisodeData(np.arange(601) / 30.0, rng.normal(size=(601, 6)), sent, sent, np.zeros(600))
+        for sent in rng.uniform(-1.0, 1.0, (2, 600, 2))
+    ]
+    model = CarModel(SimulatorConfig(), 1, {"motor.drive_gain": (5.0, 12.0)})
+    with pytest.raises(InferenceReached):
+        car_fit.fit_car(transitions_of(drives, 1), model, car_fit.CarFitSettings())
+    inputs, outputs, numbers = given["inputs"], given["outputs"], given["step_numbers"]
+    assert len(numbers) == car_fit.MAX_ROWS
+    order = numbers.argsort()
+    consecutive = numbers[order].diff() == 1
+    assert int(consecutive.sum()) >= car_fit.MAX_ROWS * (1 - 1 / BLOCK_ROWS) - 2
+    before, after = order[:-1][consecutive], order[1:][consecutive]
+    assert torch.allclose(inputs[before, :3] + outputs[before, 3:], inputs[after, :3], atol=1e-5)

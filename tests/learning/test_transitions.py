@@ -33,6 +33,19 @@ def test_row_of_a_tick_ends_with_the_command_of_that_tick():
         assert row[-1] == pytest.approx(-tick / 100.0)
 
 
+def test_step_numbers_differ_by_one_exactly_between_consecutive_steps_of_an_episode():
+    """The velocities after a step are those before the next one, as in no other pair of the random states."""
+    first = episode(12, seed=1)
+    times_s = first.times_s.copy()
+    times_s[6:] += 1.0
+    with_gap = dataclasses.replace(first, times_s=times_s)
+    rows = transitions_of([with_gap, episode(9, seed=2)], 1)
+    after = rows.inputs[:, :3] + rows.targets[:, 3:]
+    follows = np.isclose(after[:, None], rows.inputs[None, :, :3]).all(axis=2)
+    assert follows.sum() > 10
+    np.testing.assert_array_equal(rows.step_numbers[None] - rows.step_numbers[:, None] == 1, follows)
+
+
 def test_targets_are_changes_in_the_body_frame():
     """For a car facing +y, motion along +y is ahead and motion along -x is to the left."""
     base = episode(2)

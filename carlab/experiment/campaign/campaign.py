@@ -23,7 +23,6 @@ from carlab.cars import CarChoice
 from carlab.core.documents import EpisodeEnded
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
-from carlab.core.observation import ACTION_SIZE, STATE_FEATURES
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
@@ -31,6 +30,7 @@ from carlab.core.seeds import MAX_SEED
 from carlab.core.toml_files import toml_tables
 from carlab.experiment.campaign.figures import figures_of
 from carlab.experiment.campaign.hooks import LearnHooks
+from carlab.experiment.campaign.policy_folders import observed_history, policy_folders
 from carlab.experiment.campaign.prior_correction import PriorVersion, corrected, without_ranges
 from carlab.experiment.campaign.prior_correction_process import (
     CorrectionRequest,
@@ -46,7 +46,7 @@ from carlab.experiment.episodes.result import EpisodeResult
 from carlab.experiment.episodes.session import Session
 from carlab.recording.mcap.source import has_ticks, read_documents
 from carlab.recording.run_folder import RunDirectory
-from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
+from learning.policy.sac_agent import SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
 
 T = TypeVar("T", int, bool)
@@ -362,13 +362,12 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, device: str | None = 
 
 def _check_history(campaign: Campaign) -> None:
     """Raise DataError if the newest policy observes another number of past commands than the settings state."""
-    numbers = [int(p.name) for p in campaign.run.models.glob("*") if p.name.isdecimal() and (p / AGENT_FILE).is_file()]
-    if not numbers:
+    folders = policy_folders(campaign.run.path)
+    if not folders:
         return
-    folder, history = model_folder(campaign.run.models, max(numbers)), campaign.current_plan(max(numbers) - 1).history
-    observed = (
-        SacAgent.load(folder, SacSettings(), campaign.plan.seed).observation_size - STATE_FEATURES
-    ) // ACTION_SIZE
+    folder = folders[-1]
+    history = campaign.current_plan(int(folder.name) - 1).history
+    observed = observed_history(SacAgent.load(folder, SacSettings(), campaign.plan.seed))
     if observed != history:
         raise DataError(
             f"{campaign.run.path} cannot be resumed, because the policy in {folder} observes {observed} past commands "

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carlab.core.errors import DataError
-from carlab.core.observation import ACTION_SIZE, STATE_FEATURES, feature_size
+from carlab.core.observation import feature_size
 from carlab.core.policy import Policy
 from carlab.experiment.campaign.campaign import saved_plan
+from carlab.experiment.campaign.policy_folders import has_policy, observed_history, policy_folders
 from carlab.experiment.campaign.prior_correction import LARGEST_GIVEN_HISTORY
 from carlab.experiment.campaign.training_plan import TrainingPlan
-from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
+from learning.policy.sac_agent import SacAgent, SacSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +39,13 @@ def load_policy(folder: Path) -> LearnedPolicy:
     is_model = folder.parent.name == "models" and folder.name.isdecimal()
     run = folder.parent.parent if is_model else folder
     plan = saved_plan(run)
-    folders = [folder] if is_model else sorted(p for p in run.glob("models/*") if p.name.isdecimal())
-    folders = [p for p in folders if (p / AGENT_FILE).is_file()]
+    folders = policy_folders(run)
+    if is_model:
+        folders = [folder] if has_policy(folder) else []
     if not folders:
         raise DataError(f"{folder} has no policy; name the folder of a run of carlab learn with a finished training.")
     agent = SacAgent.load(folders[-1], SacSettings(), plan.seed)
-    history = (agent.observation_size - STATE_FEATURES) // ACTION_SIZE
+    history = observed_history(agent)
     if not plan.history <= history <= LARGEST_GIVEN_HISTORY or agent.observation_size != feature_size(history):
         raise DataError(
             f"The policy in {folders[-1]} has {agent.observation_size} features, its run at least "

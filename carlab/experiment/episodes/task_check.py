@@ -28,7 +28,7 @@ TORCH_TOLERANCE = 1e-3
 MAX_TICK_S, TIMED_CALLS = 0.02, 5
 """Largest computation time [s] of a task in a tick, the shortest of some calls; at 30 Hz a tick has 0.033 s in all."""
 MAX_CALL_S = 20.0
-"""Time [s] after which a call counts as one that never returns; a first call may import a library or compile code."""
+"""Time [s] after which a call counts as one that does not return; a first call may import a library or compile code."""
 OTHER_PERIOD_S = 0.1
 """A control period other than that of carlab's tasks."""
 OTHER_DEVICE = ("to numpy", "the expected device meta", "on the same device")
